@@ -1,0 +1,376 @@
+"""The command line: list, plan, check, view, show.
+
+Exit codes: 0 a plan was found and checked (or the check passed), 1 no plan within the budget (or the check failed),
+2 bad input.  Everything that takes long to import is imported inside the command that needs it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    from mrtamp.plan import Plan
+    from mrtamp.planner import Planner
+    from mrtamp.problem import Problem
+
+FOUND, NOT_FOUND, BAD_INPUT = 0, 1, 2
+DEFAULT_BUDGET_S = 10.0
+
+
+class _BadInput(Exception):
+    """Something the person can put right; its text is all they need to see."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        code = _run(options)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        # The reader of our output has seen enough; leave nothing for the interpreter to flush.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FOUND
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return NOT_FOUND
+
+
+def _run(options: argparse.Namespace) -> int:
+    try:
+        return options.run(options)
+    except _BadInput as error:
+        message = str(error)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            raise
+        message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    except Exception as error:
+        from mrtamp.problem import MrtampError
+
+        if not isinstance(error, MrtampError):
+            raise
+        message = str(error)
+    print(f"mrtamp: {message}", file=sys.stderr)
+    if getattr(options, "json", False):
+        print(json.dumps({"ok": False, "error": message}))
+    return BAD_INPUT
+
+
+# -- commands -------------------------------------------------------------------------------------------------------
+
+
+def _list(options: argparse.Namespace) -> int:
+    from mrtamp.problem_file import list_problems
+    from mrtamp.report import table
+
+    problems = list_problems()
+    if options.json:
+        print(json.dumps(problems))
+    else:
+        print(table(("problem", "what it is about"), [(n, " ".join(d.split())) for n, d in problems.items()]))
+    return FOUND
+
+
+def _plan(options: argparse.Namespace) -> int:
+    from mrtamp.progress import ProgressLine
+
+    if options.out and options.html and options.out.resolve() == options.html.resolve():
+        raise _BadInput(f"--out and --html are the same file, {options.out}")
+    for path in (options.out, options.html):
+        _ensure_writable(path)
+    started = time.monotonic()
+    planner: Planner | None = None
+    with _stop_on_signals() as signals, ProgressLine(sys.stderr, enabled=not options.quiet) as progress:
+        try:
+            problem = _load_problem(options)
+            from mrtamp.planner import Planner
+
+            planner = Planner(problem, seed=options.seed)
+            budget = options.budget
+            if budget is None and options.iterations is None:
+                budget = DEFAULT_BUDGET_S
+            for _ in planner.improve(budget, iterations=options.iterations, first=options.first, progress=progress):
+                pass
+        except KeyboardInterrupt:
+            pass
+    elapsed = time.monotonic() - started
+    best = planner.best if planner else None
+    if best is None:
+        return _report_failure(options, planner, elapsed, stopped=bool(signals))
+    written = []
+    if options.out:
+        best.save(options.out)
+        written.append(options.out)
+    if options.html:
+        from mrtamp.view import write_html
+
+        write_html(best, options.html)
+        written.append(options.html)
+    _report_plan(options, best, elapsed, written, stopped=bool(signals))
+    if options.view:
+        _serve(best, options)
+    return FOUND
+
+
+def _report_failure(options: argparse.Namespace, planner: Planner | None, elapsed: float, *, stopped: bool) -> int:
+    explanation = planner.explain() if planner else "stopped before planning began"
+    reason = f"{'stopped' if stopped else 'no plan'} after {elapsed:.1f} s without a plan"
+    if not stopped:
+        reason = f"no plan within {_bounds(options)}"
+    if options.json:
+        print(json.dumps({"ok": False, "problem": options.problem, "reason": reason, "explanation": explanation}))
+    elif options.quiet:
+        print(f"mrtamp: {reason}", file=sys.stderr)
+    else:
+        print(f"{options.problem}: {reason}\n\n{explanation}")
+    return NOT_FOUND
+
+
+def _bounds(options: argparse.Namespace) -> str:
+    parts = [f"{options.iterations} iterations"] if options.iterations is not None else []
+    if options.budget is not None or not parts:
+        parts.insert(0, f"{options.budget or DEFAULT_BUDGET_S:g} s")
+    return " and ".join(parts)
+
+
+def _report_plan(
+    options: argparse.Namespace, plan: Plan, elapsed: float, written: list[Path], *, stopped: bool
+) -> None:
+    from mrtamp import report
+
+    if options.json:
+        files = {"out": options.out, "html": options.html}
+        data = {"ok": True, "stopped": stopped, "elapsed_s": elapsed, **report.summary(plan)}
+        data["files"] = {key: str(path) for key, path in files.items() if path}
+        print(json.dumps(data))
+        return
+    if options.quiet:
+        return
+    manner = "stopped; the best plan so far, checked" if stopped else "plan found and checked"
+    blocks = [
+        f"{plan.problem.name}: {manner} (seed {plan.seed}, {elapsed:.1f} s)",
+        report.timeline_text(plan),
+        report.cost_text(plan),
+        report.history_text(plan),
+        report.counts_text(plan),
+    ]
+    if written:
+        blocks.append("\n".join(f"wrote {path} ({_size(path)})" for path in written))
+    print("\n\n".join(block for block in blocks if block))
+
+
+def _size(path: Path) -> str:
+    size = path.stat().st_size
+    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(size / 1e3, 0.1):.1f} kB"
+
+
+def _check(options: argparse.Namespace) -> int:
+    from mrtamp.check import check_plan
+
+    report = check_plan(_load_plan(options.plan))
+    if options.json:
+        violations = [{"kind": v.kind, "message": v.message} for v in report.violations]
+        clearance = report.min_clearance_m if report.min_clearance_m != float("inf") else None
+        facts = {"samples": report.samples, "min_clearance_m": clearance, "elapsed_s": report.elapsed}
+        print(json.dumps({"ok": report.ok, "violations": violations, **facts}))
+    else:
+        print(f"{options.plan}: {report}")
+    return FOUND if report.ok else NOT_FOUND
+
+
+def _view(options: argparse.Namespace) -> int:
+    return _look(_load_plan(options.plan), options)
+
+
+def _show(options: argparse.Namespace) -> int:
+    return _look(_load_problem(options), options)
+
+
+def _look(what: Plan | Problem, options: argparse.Namespace) -> int:
+    if options.html:
+        from mrtamp.view import write_html
+
+        _ensure_writable(options.html)
+        write_html(what, options.html)
+        print(f"wrote {options.html} ({_size(options.html)})")
+    else:
+        _serve(what, options)
+    return FOUND
+
+
+def _serve(what: Plan | Problem, options: argparse.Namespace) -> None:
+    """A live window until it is stopped there, or here with Ctrl-C."""
+    from mrtamp.view import view
+
+    with _stop_on_signals():
+        try:
+            viewer = view(what)
+            # With --json, stdout holds the one object and nothing else.
+            stream = sys.stderr if getattr(options, "json", False) else sys.stdout
+            print(f"open {viewer.url} in a browser; Ctrl-C ends", file=stream, flush=True)
+            if viewer.duration > 0:
+                print("space: play or pause; 'Open Controls' has the time slider and every step", file=stream, flush=True)
+            viewer.run()
+        except KeyboardInterrupt:
+            pass
+
+
+# -- input and output -----------------------------------------------------------------------------------------------
+
+
+def _load_problem(options: argparse.Namespace) -> Problem:
+    from mrtamp.problem_file import load_problem
+
+    names = ("robots", "objects", "layout_seed")
+    parameters = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    return load_problem(options.problem, **parameters)
+
+
+def _load_plan(path: Path) -> Plan:
+    from mrtamp.plan import Plan
+
+    return Plan.load(path)
+
+
+def _ensure_writable(path: Path | None) -> None:
+    """Find out now, not after planning, that a file cannot be written; missing folders are made."""
+    if path is None:
+        return
+    if path.exists() and not path.is_file():
+        raise _BadInput(f"cannot write {path}: it is {'a directory' if path.is_dir() else 'not a regular file'}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+        if path.exists():
+            with path.open("ab"):
+                pass
+    except OSError as error:
+        raise _BadInput(f"cannot write {path}: {error.strerror}") from None
+
+
+@contextmanager
+def _stop_on_signals() -> Iterator[list[int]]:
+    """Turn the first SIGINT or SIGTERM into a KeyboardInterrupt; a second one ends the process at once.
+
+    Yields the list of signals received so far.
+    """
+    received: list[int] = []
+    watched = (signal.SIGINT, signal.SIGTERM)
+
+    def handle(number: int, frame: object) -> NoReturn:
+        received.append(number)
+        for s in watched:
+            signal.signal(s, signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    previous = {s: signal.signal(s, handle) for s in watched}
+    try:
+        yield received
+    finally:
+        # After a first signal the default action stays: what follows, writing files, can still be aborted.
+        if not received:
+            for s, handler in previous.items():
+                signal.signal(s, handler)
+
+
+# -- arguments ------------------------------------------------------------------------------------------------------
+
+
+def _positive(kind: Callable[[str], float], meaning: str) -> Callable[[str], float]:
+    def convert(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"found {text!r}, expected {meaning}") from None
+        if not 0 < value < float("inf"):
+            raise argparse.ArgumentTypeError(f"found {text!r}, expected {meaning}")
+        return value
+
+    return convert
+
+
+def _natural(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number from 0")
+    return int(text)
+
+
+class _Version(argparse.Action):
+    """Prints the version; a class of its own because finding it out takes longer than everything else."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        from mrtamp import __version__
+
+        print(f"mrtamp {__version__}")
+        parser.exit()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="mrtamp",
+        description="Plan what several robot arms do together: who handles what, when, and every motion.",
+        epilog="Exit codes: 0 found and checked, 1 no plan or a failed check, 2 bad input.",
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    count = _positive(int, "a whole number from 1")
+
+    def problem_arguments(command: argparse.ArgumentParser) -> None:
+        command.add_argument(
+            "problem", metavar="PROBLEM|FILE", help="a shipped problem (see mrtamp list) or a YAML file"
+        )
+        command.add_argument("--robots", type=count, metavar="N", help="number of robots (pick_place)")
+        command.add_argument("--objects", type=count, metavar="N", help="number of objects (pick_place)")
+        command.add_argument("--layout-seed", type=_natural, metavar="N", help="seed of the layout (pick_place)")
+
+    listing = commands.add_parser("list", help="list the shipped problems")
+    listing.add_argument("--json", action="store_true", help="print one JSON object")
+    listing.set_defaults(run=_list)
+
+    plan = commands.add_parser("plan", help="plan a problem and keep improving the plan")
+    problem_arguments(plan)
+    plan.add_argument("--seed", type=_natural, default=0, metavar="N", help="seed of the planner (default 0)")
+    seconds = _positive(float, "a positive number of seconds")
+    plan.add_argument("--budget", type=seconds, metavar="S", help=f"seconds of planning (default {DEFAULT_BUDGET_S:g})")
+    plan.add_argument("--iterations", type=count, metavar="N", help="stop after N iterations; repeatable for a seed")
+    plan.add_argument("--first", action="store_true", help="stop at the first plan")
+    plan.add_argument("--out", type=Path, metavar="FILE", help="write the plan (JSON)")
+    plan.add_argument("--html", type=Path, metavar="FILE", help="write a page with the animation, good without network")
+    plan.add_argument("--view", action="store_true", help="open a live window on the plan afterwards")
+    how = plan.add_mutually_exclusive_group()
+    how.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    how.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    plan.set_defaults(run=_plan)
+
+    check = commands.add_parser("check", help="judge a plan file, from the problem and the plan alone")
+    check.add_argument("plan", type=Path, metavar="PLAN", help="a plan file")
+    check.add_argument("--json", action="store_true", help="print one JSON object")
+    check.set_defaults(run=_check)
+
+    viewing = commands.add_parser("view", help="look at a plan: play, pause, time slider")
+    viewing.add_argument("plan", type=Path, metavar="PLAN", help="a plan file")
+    viewing.add_argument("--html", type=Path, metavar="FILE", help="write a page instead of opening a window")
+    viewing.set_defaults(run=_view)
+
+    show = commands.add_parser("show", help="look at a problem before planning it")
+    problem_arguments(show)
+    show.add_argument("--html", type=Path, metavar="FILE", help="write a page instead of opening a window")
+    show.set_defaults(run=_show)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

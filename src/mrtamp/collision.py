@@ -1,0 +1,328 @@
+"""Collision queries, factored: one robot with what it holds against the world, and pairs of robots.
+
+Every query is answered by Drake's `QueryObject.HasCollisions` on a small plant of its own (DESIGN section 4).  What a
+robot holds is a *slot*: a free body of the object's shape that may touch the gripper's bodies, so that changing a mode never
+changes a collision filter.  Between two robots the arms' shapes are padded, because edges are checked at samples only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, QueryObject
+from pydrake.geometry import Box, Capsule, Cylinder, Sphere
+
+from mrtamp.kinematics import Chain, Tool, quaternions
+from mrtamp.modes import Attachment
+from mrtamp.problem import MovableObject, Problem
+from mrtamp.scene import Scene, build_scene, chain_of, geometry_ids, gripper_bodies, robot_bodies
+
+RESOLUTION = 0.01
+"""Largest distance (m) that any tracked point of a robot moves between two checked samples."""
+PADDING = 0.003
+"""Growth (m) of the arms' collision shapes in queries between two robots."""
+CONTACT_DEPTH = 1e-3
+"""Penetration (m) up to which an object counts as touching what it is lifted from or put on."""
+_FAR = 50.0
+
+
+@dataclass
+class Counts:
+    """What the planner did, for reports that do not depend on the machine."""
+
+    collision_checks: int = 0
+    ik_attempts: int = 0
+    ik_successes: int = 0
+    edges_validated: int = 0
+    nodes: int = 0
+
+    def as_dict(self) -> dict[str, int]:
+        """The counts by name."""
+        return dict(vars(self))
+
+
+def shape_key(item: MovableObject) -> str:
+    """Objects with the same key share one slot: their collision geometry is the same."""
+    return f"{item.shape.kind}{item.shape.size}" if item.shape else f"model {item.model}"
+
+
+def bisection_order(n: int) -> np.ndarray:
+    """The indices 0..n-1, ends first, then midpoints of the widest gaps: an invalid edge is found out early."""
+    if n <= 2:
+        return np.arange(n)
+    order, gaps = [0, n - 1], [(0, n - 1)]
+    for low, high in gaps:
+        middle = (low + high) // 2
+        if middle not in (low, high):
+            order.append(middle)
+            gaps += [(low, middle), (middle, high)]
+    return np.array(order)
+
+
+def _slots(problem: Problem, prefix: str) -> dict[str, MovableObject]:
+    out: dict[str, MovableObject] = {}
+    for item in problem.objects:
+        out.setdefault(f"{prefix}:{shape_key(item)}", item)
+    return out
+
+
+def _radius(scene: Scene, body_geometries: Sequence) -> tuple[np.ndarray, float]:
+    """A sphere, in the body frame, around some collision geometries of one body."""
+    inspector = scene.scene_graph.model_inspector()
+    corners = []
+    for g in body_geometries:
+        X = inspector.GetPoseInFrame(g).GetAsMatrix4()
+        shape = inspector.GetShape(g)
+        if isinstance(shape, Sphere):
+            half, extra = np.zeros(3), shape.radius()
+        elif isinstance(shape, Capsule):
+            half, extra = np.array([0, 0, shape.length() / 2]), shape.radius()
+        elif isinstance(shape, Cylinder):
+            half, extra = np.array([shape.radius(), shape.radius(), shape.length() / 2]), 0.0
+        elif isinstance(shape, Box):
+            half, extra = shape.size() / 2, 0.0
+        else:
+            hull = inspector.GetConvexHull(g)
+            if hull is None:
+                continue
+            points = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+            corners += [(X[:3, :3] @ p + X[:3, 3], 0.0) for p in points]
+            continue
+        for signs in np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T:
+            corners.append((X[:3, :3] @ (signs * half) + X[:3, 3], extra))
+    if not corners:
+        return np.zeros(3), 0.0
+    points = np.array([c[0] for c in corners])
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    return centre, float(max(np.linalg.norm(p - centre) + e for p, (_, e) in zip(points, corners, strict=True)))
+
+
+@dataclass
+class Bounds:
+    """Bounding spheres of a robot's bodies: the cheap first answer, and the points that set an edge's resolution."""
+
+    chain: Chain
+    bodies: list[str]
+    centres: np.ndarray
+    radii: np.ndarray
+
+    def spheres(self, q: np.ndarray) -> np.ndarray:
+        """World centres (N, B, 3) at configurations q (N, n)."""
+        R, p = self.chain.poses(q, self.bodies)
+        return np.swapaxes(p + np.einsum("bnij,bj->bni", R, self.centres), 0, 1)
+
+
+class RobotWorld:
+    """One robot, open-handed or holding something, against itself, the static world and resting objects."""
+
+    def __init__(self, problem: Problem, name: str, counts: Counts) -> None:
+        self.name = name
+        self.counts = counts
+        resting = {o.name: o for o in problem.objects}
+        slots = _slots(problem, "held")
+        scene = build_scene(problem, robots=[name], free_bodies={**resting, **slots})
+        self.scene = scene
+        self.in_scene = scene.robots[name]
+        self.chain, self.tool = chain_of(scene, name)
+        self.home = problem.robot(name).home
+        plant, manager = scene.plant, scene.scene_graph.collision_filter_manager()
+
+        def geometries(bodies: Mapping) -> list:
+            return [g for b in bodies.values() for g in geometry_ids(plant, b)]
+
+        objects = geometries({k: scene.free_bodies[k] for k in resting})
+        held = geometries({k: scene.free_bodies[k] for k in slots})
+        static = geometries(scene.statics)
+        hand = geometry_ids(plant, gripper_bodies(plant, self.in_scene))
+        declare = CollisionFilterDeclaration()
+        declare.ExcludeWithin(GeometrySet(objects)).ExcludeBetween(GeometrySet(objects), GeometrySet(static))
+        declare.ExcludeWithin(GeometrySet(held)).ExcludeBetween(GeometrySet(held), GeometrySet(hand))
+        manager.Apply(declare)
+        self.slot_of = {o.name: f"held:{shape_key(o)}" for o in problem.objects}
+        self.root, self.context = scene.context()
+        self._port = plant.get_geometry_query_input_port()
+        self._plant = plant
+        self._owner = _owners(scene)
+        template = plant.GetPositions(self.context)
+        for i, body in enumerate(scene.floating):
+            X = np.eye(4)
+            X[:3, 3] = [_FAR + 5.0 * i, _FAR, _FAR]
+            scene.write_pose(template, body, X)
+        template[self.in_scene.fingers] = self.in_scene.finger_positions(None)
+        template[self.in_scene.arm] = self.home
+        self._template = template
+        self.bounds = _robot_bounds(scene, name, self.chain)
+        self.object_radius = {o: _body_radius(scene, o) for o in resting}
+        self._pose7: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def rows(self, q: np.ndarray, held: Attachment | None, objects: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Position vectors (N, nq) of the plant for configurations q (N, n) and resting poses X_WO (4, 4)."""
+        rows = np.repeat(self._template[None], len(q), axis=0)
+        rows[:, self.in_scene.arm] = q
+        for name, X in objects.items():
+            k = self.scene.floating[name]
+            rows[:, k : k + 7] = self._seven(X)
+        if held is not None:
+            rows[:, self.in_scene.fingers] = self.in_scene.finger_positions(held.width)
+            write_held(self.scene, rows, self.slot_of[held.object], self.tool, q, held)
+        return rows
+
+    def _seven(self, X: np.ndarray) -> np.ndarray:
+        known = self._pose7.get(id(X))
+        if known is None or known[0] is not X:
+            known = (X, np.concatenate([quaternions(X[None, :3, :3])[0], X[:3, 3]]))
+            self._pose7[id(X)] = known
+        return known[1]
+
+    def first_hit(self, rows: np.ndarray, contact: str | None = None, slot: str | None = None) -> int:
+        """Index of the first row in collision, or -1.  `contact`: a body that the slot may touch."""
+        plant, context, port = self._plant, self.context, self._port
+        for i, row in enumerate(rows):
+            plant.SetPositions(context, row)
+            self.counts.collision_checks += 1
+            query = port.Eval(context)
+            if query.HasCollisions() and not (contact and self._only_touching(query, contact, slot)):
+                return i
+        return -1
+
+    def hits(self, rows: np.ndarray) -> np.ndarray:
+        """Which rows are in collision (N,)."""
+        return np.array([self.first_hit(row[None]) == 0 for row in rows], dtype=bool)
+
+    def _only_touching(self, query: QueryObject, contact: str, slot: str | None) -> bool:
+        for pair in query.ComputePointPairPenetration():
+            names = {self._owner[pair.id_A], self._owner[pair.id_B]}
+            if names != {contact, slot} or pair.depth > CONTACT_DEPTH:
+                return False
+        return True
+
+    def culprits(self, row: np.ndarray, contact: str | None = None, slot: str | None = None) -> list[tuple[str, str]]:
+        """Names of the two owners (robot, static body, object or slot) of every collision at one row."""
+        self._plant.SetPositions(self.context, row)
+        pairs = self._port.Eval(self.context).ComputePointPairPenetration()
+        found = [(self._owner[p.id_A], self._owner[p.id_B], p.depth) for p in pairs]
+        return [(a, b) for a, b, d in found if not ({a, b} == {contact, slot} and d <= CONTACT_DEPTH)]
+
+
+class RobotPair:
+    """Two robots with what they hold, against each other only."""
+
+    def __init__(self, problem: Problem, a: RobotWorld, b: RobotWorld, counts: Counts) -> None:
+        self.counts = counts
+        self.worlds = (a, b)
+        slots = (_slots(problem, a.name), _slots(problem, b.name))
+        scene = build_scene(
+            problem,
+            robots=[a.name, b.name],
+            free_bodies={**slots[0], **slots[1]},
+            statics=False,
+            padding={a.name: PADDING, b.name: PADDING},
+        )
+        self.scene = scene
+        plant, manager = scene.plant, scene.scene_graph.collision_filter_manager()
+        for world, own in zip(self.worlds, slots, strict=True):
+            bodies = robot_bodies(plant, scene.robots[world.name]) + [b for s in own for b in scene.free_bodies[s]]
+            # A robot's own collisions are judged in its own plant.
+            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(geometry_ids(plant, bodies))))
+        self.slot_of = [{o.name: f"{w.name}:{shape_key(o)}" for o in problem.objects} for w in self.worlds]
+        self.root, self.context = scene.context()
+        self._plant, self._port = plant, plant.get_geometry_query_input_port()
+        template = plant.GetPositions(self.context)
+        for i, body in enumerate(scene.floating):
+            X = np.eye(4)
+            X[:3, 3] = [_FAR + 5.0 * i, _FAR, _FAR]
+            scene.write_pose(template, body, X)
+        self._template = template
+
+    def first_hit(
+        self,
+        qa: np.ndarray,
+        held_a: Attachment | None,
+        qb: np.ndarray,
+        held_b: Attachment | None,
+        widths: tuple[float | None, float | None] = (None, None),
+    ) -> int:
+        """Index of the first pair of rows of qa (N, na), qb (N, nb) in collision, or -1.
+
+        `widths` are the openings (m) of hands that hold nothing; None: fully open.
+        """
+        rows = np.repeat(self._template[None], len(qa), axis=0)
+        for i, (q, held) in enumerate(((qa, held_a), (qb, held_b))):
+            in_scene = self.scene.robots[self.worlds[i].name]
+            rows[:, in_scene.arm] = q
+            rows[:, in_scene.fingers] = in_scene.finger_positions(held.width if held else widths[i])
+            if held is not None:
+                write_held(self.scene, rows, self.slot_of[i][held.object], self.worlds[i].tool, q, held)
+        plant, context, port = self._plant, self.context, self._port
+        for i, row in enumerate(rows):
+            plant.SetPositions(context, row)
+            self.counts.collision_checks += 1
+            if port.Eval(context).HasCollisions():
+                return i
+        return -1
+
+
+def write_held(scene: Scene, rows: np.ndarray, slot: str, tool: Tool, q: np.ndarray, held: Attachment) -> None:
+    """Write the pose of a held object for configurations q (N, n) into position vectors (N, nq) in place."""
+    R, p = tool.pose(q)
+    k = scene.floating[slot]
+    rows[:, k : k + 4] = quaternions(R @ held.X_PO[:3, :3])
+    rows[:, k + 4 : k + 7] = p + R @ held.X_PO[:3, 3]
+
+
+def _owners(scene: Scene) -> dict:
+    """Geometry id -> name of the robot, static body, object or slot it belongs to."""
+    out = {}
+    for name, in_scene in scene.robots.items():
+        out.update(dict.fromkeys(geometry_ids(scene.plant, robot_bodies(scene.plant, in_scene)), name))
+    for name, bodies in [*scene.statics.items(), *scene.free_bodies.items()]:
+        out.update(dict.fromkeys(geometry_ids(scene.plant, bodies), name))
+    return out
+
+
+def _body_radius(scene: Scene, name: str) -> float:
+    """Radius (m) around the body's origin that holds a free body."""
+    centre, radius = _radius(scene, geometry_ids(scene.plant, scene.free_bodies[name]))
+    return float(np.linalg.norm(centre)) + radius
+
+
+def _robot_bounds(scene: Scene, name: str, chain: Chain) -> Bounds:
+    in_scene = scene.robots[name]
+    gripper = in_scene.robot.model.gripper
+    moving = set(gripper.bodies) if gripper else set()
+    names, centres, radii = [], [], []
+    for body in robot_bodies(scene.plant, in_scene):
+        geometries = scene.plant.GetCollisionGeometriesForBody(body)
+        if not geometries or body.name() not in chain._index:
+            continue
+        centre, radius = _radius(scene, geometries)
+        # Fingers travel by at most half the opening from where the chain shows them.
+        extra = gripper.max_width / 2 if gripper and body.name() in moving else 0.0
+        names.append(body.name())
+        centres.append(centre)
+        radii.append(radius + extra)
+    return Bounds(chain, names, np.array(centres), np.array(radii))
+
+
+@dataclass
+class Collision:
+    """All collision plants of a problem: one per robot at once, one per pair of robots when first needed."""
+
+    problem: Problem
+    counts: Counts = field(default_factory=Counts)
+    worlds: dict[str, RobotWorld] = field(default_factory=dict)
+    _pairs: dict[tuple[str, str], RobotPair] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for robot in self.problem.robots:
+            self.worlds[robot.name] = RobotWorld(self.problem, robot.name, self.counts)
+
+    def pair(self, a: str, b: str) -> tuple[RobotPair, bool]:
+        """The plant of robots a and b, and whether it knows them in the other order."""
+        if (b, a) in self._pairs:
+            return self._pairs[b, a], True
+        if (a, b) not in self._pairs:
+            self._pairs[a, b] = RobotPair(self.problem, self.worlds[a], self.worlds[b], self.counts)
+        return self._pairs[a, b], False

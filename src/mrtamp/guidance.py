@@ -1,0 +1,245 @@
+"""Where planning effort goes: optimistic modal guidance, orbit-path guidance, persistent exploration (paper, section V).
+
+Guidance works on names alone: for each object a small graph whose nodes are the places it can be (supports, robots) and whose edges are
+pick, place and handover, each at an optimistic cost of one, dearer the more often it was tried in vain.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import networkx as nx
+import numpy as np
+
+from mrtamp.modes import Mode, condition_holds
+from mrtamp.problem import AtPose, HeldBy, Problem, RobotAt
+from mrtamp.transitions.sampler import StratumKey, TransitionSampler
+
+FAILED_CALL = 3.0
+"""What a sampling call without any accepted sample adds to the optimistic cost of its edge."""
+UNREACHABLE = 6.0
+"""Cost added before any attempt where the place lies outside the reach that was seen of the robot."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One elementary transition by name: what to sample."""
+
+    kind: str
+    robots: tuple[str, ...]
+    object: str
+    place: str
+
+    @property
+    def key(self) -> StratumKey:
+        """The key of its stratum's statistics."""
+        return (self.kind, self.robots, self.object, self.place)
+
+
+class ModalGuidance:
+    """Estimates how far modes are from the goal and proposes the transitions that lead there."""
+
+    def __init__(self, problem: Problem, sampler: TransitionSampler) -> None:
+        self.problem = problem
+        self.sampler = sampler
+        self.robots = [r.name for r in problem.robots if r.model.gripper is not None]
+        self._static = sampler.validity.X_WB
+        self._conditions = {c.object: c for c in problem.goal if not isinstance(c, RobotAt)}
+        self._supports = {
+            o.name: [s for s in problem.supports if s.body != o.name and (s.objects is None or o.name in s.objects)]
+            for o in problem.objects
+        }
+        self._costs: dict[str, tuple[int, dict[str, float]]] = {}
+        self.failures: Counter[tuple[tuple, Choice]] = Counter()
+        self._reach_prior: dict[tuple[str, str], float] = {}
+
+    # -- distances ------------------------------------------------------------------------------------------------
+
+    def edge_cost(self, choice: Choice) -> float:
+        """Optimistic cost of one transition: one, and what failed attempts and reach say against it."""
+        outcome = self.sampler.outcomes.get(choice.key)
+        if outcome is None or outcome.calls == 0:
+            return 1.0 + self._prior(choice)
+        if outcome.accepted:
+            return 1.0
+        return 1.0 + FAILED_CALL * outcome.calls + self._prior(choice)
+
+    def _prior(self, choice: Choice) -> float:
+        if choice.kind == "handover":
+            a, b = (self.sampler.reach[r] for r in choice.robots)
+            # A handover costs an extra transition already; between robots too far apart it cannot happen.
+            return 0.0 if np.linalg.norm(a[0] - b[0]) < a[1] + b[1] else UNREACHABLE
+        key = (choice.robots[0], choice.place)
+        if key not in self._reach_prior:
+            support = next((s for s in self.problem.supports if s.name == choice.place), None)
+            prior = 0.0
+            if support is not None and support.body in self._static:
+                X_WS = self._static[support.body] @ (support.X_BO or support.X_BS).GetAsMatrix4()
+                half = np.asarray(support.size) / 2
+                centre, radius = self.sampler.reach[choice.robots[0]]
+                local = np.linalg.inv(X_WS) @ np.append(centre, 1.0)
+                nearest = np.clip(local[:3], [-half[0], -half[1], 0], [half[0], half[1], 0])
+                prior = 0.0 if np.linalg.norm(local[:3] - nearest) <= radius else UNREACHABLE
+            self._reach_prior[key] = prior
+        return self._reach_prior[key]
+
+    def goal_places(self, item: str) -> list[str]:
+        """Names of the supports or the robot that satisfy the object's goal."""
+        condition = self._conditions.get(item)
+        if isinstance(condition, HeldBy):
+            return [condition.robot]
+        return [s.name for s in self.sampler.goal_supports[item]]
+
+    def costs_to_goal(self, item: str) -> dict[str, float]:
+        """Optimistic number of transitions from every place of an object to its goal."""
+        version = sum(o.calls for k, o in self.sampler.outcomes.items() if k[2] == item)
+        known = self._costs.get(item)
+        if known is not None and known[0] == version:
+            return known[1]
+        graph = nx.DiGraph()
+        for choice in self._choices(item):
+            start, end = _ends(choice)
+            cost = self.edge_cost(choice)
+            if not graph.has_edge(end, start) or graph.edges[end, start]["weight"] > cost:
+                graph.add_edge(end, start, weight=cost)
+        goals = [p for p in self.goal_places(item) if p in graph]
+        costs = nx.multi_source_dijkstra_path_length(graph, set(goals)) if goals else {}
+        self._costs[item] = (version, costs)
+        return costs
+
+    def _choices(self, item: str) -> list[Choice]:
+        fits = [r for r in self.robots if self.sampler.families[r, item]]
+        out = []
+        for r in fits:
+            for s in self._supports[item]:
+                out += [Choice("pick", (r,), item, s.name), Choice("place", (r,), item, s.name)]
+            out += [Choice("handover", (r, b), item, r) for b in fits if b != r]
+        return out
+
+    def done(self, mode: Mode, item: str) -> bool:
+        """Whether the object satisfies its goal and rests on nothing that still has to move."""
+        condition = self._conditions.get(item)
+        if condition is not None and not condition_holds(self.problem, condition, mode, self._static):
+            return False
+        a = mode.of[item]
+        return a.held or a.parent not in mode.of or self.done(mode, a.parent)
+
+    def remaining(self, mode: Mode) -> float:
+        """Optimistic number of transitions from `mode` to a goal mode."""
+        return sum(self._remaining(mode, item) for item in mode.of)
+
+    def _remaining(self, mode: Mode, item: str) -> float:
+        a = mode.of[item]
+        condition = self._conditions.get(item)
+        if self.done(mode, item):
+            return 0.0
+        if condition is None:
+            # Without a goal of its own, it is only in the way of what it rests on.
+            return 2.0
+        if condition_holds(self.problem, condition, mode, self._static):
+            return 4.0
+        return self.costs_to_goal(item).get(a.place, 2.0 + FAILED_CALL)
+
+    # -- proposals ------------------------------------------------------------------------------------------------
+
+    def enabled(self, mode: Mode) -> list[Choice]:
+        """Every elementary transition whose discrete conditions hold in `mode`."""
+        out = []
+        for item in mode.of:
+            a = mode.of[item]
+            if item in mode.loaded:
+                continue
+            for choice in self._choices(item):
+                start, end = _ends(choice)
+                if start != a.place or (choice.kind != "place" and end in mode.held):
+                    continue
+                if choice.kind == "place":
+                    body = self.problem.support(choice.place).body
+                    if body in mode.of and mode.of[body].held:
+                        continue
+                out.append(choice)
+        return out
+
+    def proposals(self, mode: Mode) -> list[tuple[float, Choice]]:
+        """Enabled transitions with how dear each is by the optimistic estimate; zero is on a best path, lowest first."""
+        out = []
+        blockers = self._blockers(mode)
+        enabled = self.enabled(mode)
+        for choice in enabled:
+            item = choice.object
+            start, end = _ends(choice)
+            failed = self.failures[mode.attachments, choice]
+            if self.done(mode, item) and item not in blockers:
+                continue
+            costs = self.costs_to_goal(item)
+            rest = costs.get(end, 2.0 + FAILED_CALL)
+            here = costs.get(start, rest)
+            detour = self.edge_cost(choice) + rest - here
+            if item in blockers or (start in self.goal_places(item) and choice.kind == "pick"):
+                # Out of the way, to anywhere.
+                detour = min(detour, 1.0)
+            out.append((max(detour, 0.0) + self._not_yet(mode, choice) + 1.5 * failed, choice))
+        out.sort(key=lambda pair: pair[0])
+        return out
+
+    def _not_yet(self, mode: Mode, choice: Choice) -> float:
+        """How much speaks against acting now: what the object goes onto is not in its own goal yet."""
+        condition = self._conditions.get(choice.object)
+        penalty = 0.0
+        if isinstance(condition, AtPose) and condition.on in mode.of and not self.done(mode, condition.on):
+            penalty = 2.0
+        if choice.kind == "place":
+            body = self.problem.support(choice.place).body
+            if body in mode.of and not self.done(mode, body):
+                # Whatever is put there now has to come off again.
+                penalty += 4.0
+            elif condition is not None and choice.place not in self.goal_places(choice.object):
+                penalty += 0.5
+        return penalty
+
+    def _blockers(self, mode: Mode) -> set[str]:
+        """Resting objects that kept others from their places or picks, by the statistics of what failed."""
+        out: set[str] = set()
+        for (kind, _robots, item, _place), outcome in self.sampler.outcomes.items():
+            if outcome.accepted or item not in mode.of or self.done(mode, item) or kind == "handover":
+                continue
+            out |= {name for name in outcome.collisions if name in mode.of and name != item}
+        return {name for name in out if not mode.of[name].held}
+
+    def feasible_sets(self, mode: Mode, rng: np.random.Generator) -> list[Choice]:
+        """A uniformly random non-empty active set and a random elementary transition for each of its robots.
+
+        Empty when the drawn set has no joint assignment: the caller draws again another time.
+        """
+        enabled = self.enabled(mode)
+        names = [r.name for r in self.problem.robots]
+        members = [n for n in names if rng.random() < 0.5] or [names[int(rng.integers(len(names)))]]
+        out: list[Choice] = []
+        used: set[str] = set()
+        for name in members:
+            if name in used:
+                continue
+            options = [
+                c
+                for c in enabled
+                if name in c.robots
+                and set(c.robots) <= set(members)
+                and not used & set(c.robots)
+                and all(c.object != o.object for o in out)
+            ]
+            if not options:
+                return []
+            choice = options[int(rng.integers(len(options)))]
+            out.append(choice)
+            used |= set(choice.robots)
+        return out
+
+
+def _ends(choice: Choice) -> tuple[str, str]:
+    """Place before and place after."""
+    if choice.kind == "pick":
+        return choice.place, choice.robots[0]
+    if choice.kind == "place":
+        return choice.robots[0], choice.place
+    return choice.robots[0], choice.robots[1]

@@ -1,0 +1,272 @@
+"""Batched kinematics of one robot in numpy, extracted from its Drake plant.
+
+Drake evaluates one configuration per call; sampling transition strata needs thousands.  `Chain` reads the joint
+tree of a robot out of a finalised `MultibodyPlant` (no second description of the robot exists) and evaluates body
+poses, the grasp frame and its Jacobian for a whole batch at once.  Poses are kept as rotation `R` (N, 3, 3) and
+translation `p` (N, 3), expressed in the world W.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
+
+from mrtamp.problem import MrtampError
+
+Array = np.ndarray
+
+
+def inverse(X: Array) -> Array:
+    """Inverse of rigid transforms, shape (..., 4, 4)."""
+    Y = np.zeros_like(X)
+    Rt = np.swapaxes(X[..., :3, :3], -1, -2)
+    Y[..., :3, :3] = Rt
+    Y[..., :3, 3] = -(Rt @ X[..., :3, 3:])[..., 0]
+    Y[..., 3, 3] = 1.0
+    return Y
+
+
+def matrix(R: Array, p: Array) -> Array:
+    """Homogeneous transforms (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    X = np.zeros((*R.shape[:-2], 4, 4))
+    X[..., :3, :3] = R
+    X[..., :3, 3] = p
+    X[..., 3, 3] = 1.0
+    return X
+
+
+def quaternions(R: Array) -> Array:
+    """Unit quaternions (N, 4), order w, x, y, z, of rotation matrices (N, 3, 3); largest-component form."""
+    m = R.reshape(-1, 9)
+    xx, yy, zz = m[:, 0], m[:, 4], m[:, 8]
+    # The 4x4 outer product q q^T times four; the row with the largest diagonal is the best conditioned.
+    K = np.empty((len(m), 4, 4))
+    K[:, 0, 0] = 1 + xx + yy + zz
+    K[:, 1, 1] = 1 + xx - yy - zz
+    K[:, 2, 2] = 1 - xx + yy - zz
+    K[:, 3, 3] = 1 - xx - yy + zz
+    K[:, 0, 1] = K[:, 1, 0] = m[:, 7] - m[:, 5]
+    K[:, 0, 2] = K[:, 2, 0] = m[:, 2] - m[:, 6]
+    K[:, 0, 3] = K[:, 3, 0] = m[:, 3] - m[:, 1]
+    K[:, 1, 2] = K[:, 2, 1] = m[:, 1] + m[:, 3]
+    K[:, 1, 3] = K[:, 3, 1] = m[:, 2] + m[:, 6]
+    K[:, 2, 3] = K[:, 3, 2] = m[:, 5] + m[:, 7]
+    best = np.argmax(np.einsum("nii->ni", K), axis=1)
+    q = K[np.arange(len(m)), best]
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def rotation_vectors(R: Array) -> Array:
+    """Rotation vectors (N, 3), angle times axis, of rotation matrices (N, 3, 3)."""
+    q = quaternions(R)
+    q = np.where(q[:, :1] < 0, -q, q)
+    norm = np.linalg.norm(q[:, 1:], axis=1)
+    angle = 2 * np.arctan2(norm, q[:, 0])
+    scale = np.where(norm > 1e-12, angle / np.maximum(norm, 1e-300), 2.0)
+    return q[:, 1:] * scale[:, None]
+
+
+@dataclass
+class _Link:
+    """One body: X_WL = X_W(parent) * (R, p) * motion of its joint along or about the local z."""
+
+    parent: int
+    R: Array
+    p: Array
+    kind: str
+    column: int
+    R_after: Array
+    p_after: Array
+
+
+def _rotation_to_z(axis: Array) -> Array:
+    """A rotation whose third column is `axis`."""
+    z = axis / np.linalg.norm(axis)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+class Chain:
+    """Forward kinematics of one robot's bodies for batches of arm configurations.
+
+    Parameters
+    ----------
+    plant : finalised plant that contains the robot.
+    instance : the robot's model instance.
+    base : name of its base link, fixed in the world at `X_WB`.
+    arm_joints : names of the n joints that are planned for, in the order of q.
+    fixed : positions (rad or m) of the other joints, such as fingers.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        instance: ModelInstanceIndex,
+        base: str,
+        X_WB: RigidTransform,
+        arm_joints: tuple[str, ...],
+        fixed: dict[str, float],
+    ) -> None:
+        self.n = len(arm_joints)
+        self.lower = np.empty(self.n)
+        self.upper = np.empty(self.n)
+        self.velocity = np.empty(self.n)
+        self.prismatic = np.zeros(self.n, dtype=bool)
+        self.bodies: list[str] = [base]
+        self._links = [_Link(-1, X_WB.rotation().matrix(), X_WB.translation(), "weld", -1, np.eye(3), np.zeros(3))]
+        joints = [plant.get_joint(j) for j in plant.GetJointIndices(instance)]
+        self._index = {base: 0}
+        pending = [j for j in joints if j.child_body().name() != base]
+        while pending:
+            ready = [j for j in pending if j.parent_body().name() in self._index]
+            if not ready:
+                break
+            for joint in ready:
+                self._append(joint, arm_joints, fixed)
+            pending = [j for j in pending if j.child_body().name() not in self._index]
+        missing = [name for name in arm_joints if not any(j.name() == name for j in joints)]
+        if missing:
+            raise MrtampError(f"arm joints {missing} do not exist; the model has {[j.name() for j in joints]}")
+
+    def _append(self, joint, arm_joints: tuple[str, ...], fixed: dict[str, float]) -> None:
+        X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
+        X_MC = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+        kind = joint.type_name()
+        if kind == "weld":
+            X_FM = joint.X_FM()
+            before, after, kind, column = X_PF @ X_FM @ X_MC, RigidTransform(), "weld", -1
+            R, p = before.rotation().matrix(), before.translation()
+            R_after, p_after = np.eye(3), np.zeros(3)
+        elif kind in ("revolute", "prismatic"):
+            axis = joint.revolute_axis() if kind == "revolute" else joint.translation_axis()
+            Z = _rotation_to_z(np.asarray(axis))
+            R, p = X_PF.rotation().matrix() @ Z, X_PF.translation()
+            R_after = Z.T @ X_MC.rotation().matrix()
+            p_after = Z.T @ X_MC.translation()
+            if joint.name() in arm_joints:
+                column = arm_joints.index(joint.name())
+                self.lower[column] = joint.position_lower_limit()
+                self.upper[column] = joint.position_upper_limit()
+                self.velocity[column] = joint.velocity_upper_limit()
+                self.prismatic[column] = kind == "prismatic"
+            else:
+                value = fixed.get(joint.name(), 0.0)
+                if kind == "revolute":
+                    c, s = np.cos(value), np.sin(value)
+                    M = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+                    R, p = R @ M @ R_after, p + R @ M @ p_after
+                else:
+                    p = p + R @ (p_after + [0, 0, value])
+                    R = R @ R_after
+                kind, column, R_after, p_after = "weld", -1, np.eye(3), np.zeros(3)
+        else:
+            raise MrtampError(
+                f"joint {joint.name()} is of type {kind}; arms may have revolute, prismatic and fixed joints"
+            )
+        self._index[joint.child_body().name()] = len(self._links)
+        self.bodies.append(joint.child_body().name())
+        parent = self._index[joint.parent_body().name()]
+        self._links.append(_Link(parent, R, p, kind, column, R_after, p_after))
+
+    def poses(self, q: Array, bodies: list[str] | None = None) -> tuple[Array, Array]:
+        """World poses of `bodies` (default: all): R (B, N, 3, 3), p (B, N, 3) for configurations q (N, n)."""
+        Rs, ps, _ = self._sweep(q)
+        rows = range(len(self._links)) if bodies is None else [self._index[b] for b in bodies]
+        return np.stack([Rs[i] for i in rows]), np.stack([ps[i] for i in rows])
+
+    def _sweep(self, q: Array) -> tuple[list[Array], list[Array], list[tuple[int, Array, Array]]]:
+        N = len(q)
+        cos, sin = np.cos(q), np.sin(q)
+        Rs: list[Array] = []
+        ps: list[Array] = []
+        axes: list[tuple[int, Array, Array]] = []
+        for link in self._links:
+            if link.parent < 0:
+                R, p = np.broadcast_to(link.R, (N, 3, 3)), np.broadcast_to(link.p, (N, 3))
+            else:
+                Rp, pp = Rs[link.parent], ps[link.parent]
+                R, p = Rp @ link.R, pp + Rp @ link.p
+            if link.kind != "weld":
+                axes.append((link.column, R[:, :, 2], p))
+                if link.kind == "revolute":
+                    c, s = cos[:, link.column, None], sin[:, link.column, None]
+                    moved = np.empty_like(R)
+                    moved[:, :, 0] = c * R[:, :, 0] + s * R[:, :, 1]
+                    moved[:, :, 1] = c * R[:, :, 1] - s * R[:, :, 0]
+                    moved[:, :, 2] = R[:, :, 2]
+                    R = moved
+                else:
+                    p = p + R[:, :, 2] * q[:, link.column, None]
+                p = p + R @ link.p_after
+                R = R @ link.R_after
+            Rs.append(R)
+            ps.append(p)
+        return Rs, ps, axes
+
+
+class Tool:
+    """The grasp frame G of a robot: batched forward kinematics and geometric Jacobian."""
+
+    def __init__(self, chain: Chain, body: str, X_BG: RigidTransform) -> None:
+        self.chain = chain
+        self._R = X_BG.rotation().matrix()
+        self._p = X_BG.translation()
+        self._body = chain._index[body]
+        # Only the links between base and tool are swept.
+        path, i = [], self._body
+        while i >= 0:
+            path.append(i)
+            i = chain._links[i].parent
+        self._arm = _sub_chain(chain, path[::-1])
+
+    def pose(self, q: Array) -> tuple[Array, Array]:
+        """R_WG (N, 3, 3) and p_WG (N, 3) at q (N, n)."""
+        Rs, ps, _ = self._arm._sweep(q)
+        return Rs[-1] @ self._R, ps[-1] + Rs[-1] @ self._p
+
+    def matrix(self, q: Array) -> Array:
+        """X_WG (N, 4, 4) at q (N, n)."""
+        return matrix(*self.pose(q))
+
+    def jacobian(self, q: Array) -> tuple[Array, Array, Array]:
+        """R_WG, p_WG and the geometric Jacobian J (N, 6, n): rows are angular, then translational velocity in W."""
+        Rs, ps, axes = self._arm._sweep(q)
+        R, p = Rs[-1] @ self._R, ps[-1] + Rs[-1] @ self._p
+        J = np.zeros((len(q), 6, self.chain.n))
+        for column, axis, origin in axes:
+            if self.chain.prismatic[column]:
+                J[:, 3:, column] = axis
+            else:
+                r = p - origin
+                J[:, :3, column] = axis
+                J[:, 3, column] = axis[:, 1] * r[:, 2] - axis[:, 2] * r[:, 1]
+                J[:, 4, column] = axis[:, 2] * r[:, 0] - axis[:, 0] * r[:, 2]
+                J[:, 5, column] = axis[:, 0] * r[:, 1] - axis[:, 1] * r[:, 0]
+        return R, p, J
+
+
+def _sub_chain(chain: Chain, path: list[int]) -> Chain:
+    """The links of `path` alone, welds folded into their neighbours, for the tool's hot loop."""
+    arm = object.__new__(Chain)
+    arm.n = chain.n
+    links: list[_Link] = []
+    for i in path:
+        link = chain._links[i]
+        copy = _Link(len(links) - 1, link.R, link.p, link.kind, link.column, link.R_after, link.p_after)
+        if link.kind == "weld" and links:
+            last = links[-1]
+            if last.kind == "weld":
+                last.p = last.p + last.R @ link.p
+                last.R = last.R @ link.R
+            else:
+                last.p_after = last.p_after + last.R_after @ link.p
+                last.R_after = last.R_after @ link.R
+            continue
+        links.append(copy)
+    arm._links = links
+    return arm

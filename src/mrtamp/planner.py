@@ -1,0 +1,483 @@
+"""The anytime loop: modal- and orbit-guided asymptotically optimal MR-TAMP (paper, algorithm 1).
+
+Read `Planner.improve` beside the algorithm; each named step is a method below it, and the geometry lives elsewhere.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+
+import numpy as np
+
+from mrtamp.check import Checker, Report
+from mrtamp.check_report import Violation
+from mrtamp.collision import Collision, Counts
+from mrtamp.graphs import Graphs
+from mrtamp.guidance import Choice, ModalGuidance
+from mrtamp.modes import Mode, objects_done, start_mode
+from mrtamp.plan import Plan, Transition, plan_cost
+from mrtamp.problem import MrtampError, Problem, RobotAt
+from mrtamp.roadmap import Roadmap
+from mrtamp.steering import Steering
+from mrtamp.tensor_tree import At, Node, TensorTree
+from mrtamp.transitions.projection import uniform_configurations
+from mrtamp.transitions.sampler import Candidate, TransitionSampler
+from mrtamp.validity import Validity
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of the planner.
+
+    initial_vertices : free configurations per robot on the roadmaps before the search starts.
+    interior_samples : N_m, roadmap samples per iteration.  transition_samples : N_t, IK seeds per stratum and iteration.
+    extensions : candidates the tree is extended to per iteration.
+    persistent : share of iterations that ignore guidance, for ever.
+    """
+
+    initial_vertices: int = 40
+    interior_samples: int = 4
+    transition_samples: int = 48
+    extensions: int = 3
+    persistent: float = 0.15
+
+
+@dataclass(frozen=True)
+class Status:
+    """Where the planner stands, for people who wait."""
+
+    phase: str
+    iteration: int
+    elapsed_s: float
+    modes: int
+    orbits: int
+    nodes: int
+    remaining: float
+    cost: float | None
+
+
+class Planner:
+    """Plans one problem; keeps everything it learnt between calls of `improve`.
+
+    Parameters
+    ----------
+    problem : what to plan.
+    seed : of the only random generator; runs bounded by iterations are identical to the last bit for equal seeds.
+    options : settings.
+
+    Raises
+    ------
+    MrtampError : the start is in collision or a model cannot be used.
+    """
+
+    def __init__(self, problem: Problem, *, seed: int = 0, options: Options | None = None) -> None:
+        self.problem = problem
+        self.seed = seed
+        self.options = options or Options()
+        self.best: Plan | None = None
+        self._clock = time.perf_counter()
+        self._spent = 0.0
+        self.rng = np.random.default_rng(seed)
+        self.counts = Counts()
+        self.collision = Collision(problem, self.counts)
+        radius = max([0.1, *(r for w in self.collision.worlds.values() for r in w.object_radius.values())])
+        self.roadmaps = {r.name: Roadmap(self.collision.worlds[r.name], radius) for r in problem.robots}
+        self.names = list(self.roadmaps)
+        self.validity = Validity(problem, self.collision, self.roadmaps)
+        self.sampler = TransitionSampler(problem, self.collision, self.roadmaps, self.validity, self.rng)
+        self.guidance = ModalGuidance(problem, self.sampler)
+        self.graphs = Graphs()
+        self.tree = TensorTree(list(self.roadmaps.values()), problem.cost)
+        self.steering = Steering(list(self.roadmaps.values()), self.validity, self._insert, self.rng)
+        self.iteration = 0
+        self._history: list[dict[str, float]] = []
+        self._goal_vertices: dict[str, int] = {}
+        self._goal_nodes: list[Node] = []
+        self._path: list[int] = []
+        self._tree_cost = np.inf
+        self._checker: Checker | None = None
+        self._banned: set[tuple] = set()
+        self._start()
+        self._spent = time.perf_counter() - self._clock
+
+    # -- Algorithm 1 ----------------------------------------------------------------------------------------------
+
+    def improve(
+        self,
+        budget_s: float | None = None,
+        *,
+        iterations: int | None = None,
+        first: bool = False,
+        progress: Callable[[Status], None] | None = None,
+    ) -> Iterator[Plan]:
+        """Search, yielding every better plan once it has been checked.
+
+        Parameters
+        ----------
+        budget_s : seconds of planning in this call.  iterations : iterations in this call.  `None`: no bound.
+        first : stop after the first plan.
+        progress : called with a `Status` after every iteration.
+        """
+        self._clock = time.perf_counter() - self._spent
+        end = np.inf if budget_s is None else time.perf_counter() + budget_s
+        stop = np.inf if iterations is None else self.iteration + iterations
+        try:
+            while time.perf_counter() < end and self.iteration < stop:
+                orbit, choices = self._guide()
+                self._expand_roadmaps(orbit)
+                candidates = self._sample_transitions(orbit, choices)
+                for combination in candidates:
+                    self._discover_adjacent_orbit(orbit, combination)
+                self._extend_tree(orbit, choices, candidates)
+                self.iteration += 1
+                found = self._best_solution()
+                self._spent = time.perf_counter() - self._clock
+                if progress is not None:
+                    progress(self.status())
+                if found:
+                    assert self.best is not None
+                    yield self.best
+                    if first:
+                        return
+        finally:
+            self._spent = time.perf_counter() - self._clock
+
+    # -- initialisation -------------------------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        mode = start_mode(self.problem)
+        self.sampler.remember(mode)
+        at = []
+        for robot in self.problem.robots:
+            roadmap = self.roadmaps[robot.name]
+            at.append(roadmap.add_vertex(robot.start))
+            if np.max(np.abs(robot.home - robot.start)) > 0:
+                roadmap.add_vertex(robot.home)
+            for condition in self.problem.goal:
+                if isinstance(condition, RobotAt) and condition.robot == robot.name:
+                    same = np.flatnonzero(np.max(np.abs(roadmap.q - condition.q), axis=1) == 0)
+                    self._goal_vertices[robot.name] = int(same[0]) if len(same) else roadmap.add_vertex(condition.q)
+        for robot, v in zip(self.problem.robots, at, strict=True):
+            where = self.validity.stand(mode, dict(zip(self.names, at, strict=True)), (robot.name,))
+            if where is not None:
+                roadmap = self.roadmaps[robot.name]
+                rows = roadmap.world.rows(
+                    roadmap.q[[v]], None, {r.name: r.X_WO for r in self.validity.resting(mode)}
+                )
+                pairs = roadmap.world.culprits(rows[0]) or [(robot.name, where)]
+                raise MrtampError(
+                    f"problem {self.problem.name}: robot {robot.name} starts in collision ({pairs[0][0]} with {pairs[0][1]})"
+                )
+        for robot in self.problem.robots:
+            self._add_interior(robot.name, self.options.initial_vertices)
+        root_orbit = self.graphs.add_orbit(mode)
+        self.root = self.tree.add_root(mode, tuple(at), root_orbit)
+        self._note_goal(self.root)
+
+    # -- guidance -------------------------------------------------------------------------------------------------
+
+    def _guide(self) -> tuple[int, list[Choice]]:
+        """Orbit to work in and the elementary transitions Gamma to sample there (one per robot, disjoint)."""
+        explore = self.rng.random() < self.options.persistent
+        if explore:
+            orbits = list(self.graphs.orbital.nodes)
+            orbit = orbits[int(self.rng.integers(len(orbits)))]
+        elif self.best is not None:
+            orbit = self._orbit_path_guidance()
+        else:
+            orbit = self._modal_frontier()
+        self.graphs.orbital.nodes[orbit]["visits"] += 1
+        mode = self.graphs.mode(orbit)
+        self.graphs.modal.nodes[mode.state]["visits"] += 1
+        if explore:
+            return orbit, self.guidance.feasible_sets(mode, self.rng)
+        return orbit, self._optimistic_choices(mode)
+
+    def _modal_frontier(self) -> int:
+        """The orbit of the modal state that is optimistically nearest to the goal, visits held against it."""
+        best, chosen = np.inf, 0
+        for state, orbits in self.graphs.orbits_of.items():
+            if not orbits:
+                continue
+            visits = self.graphs.modal.nodes[state]["visits"]
+            orbit = min(orbits, key=lambda o: self.graphs.orbital.nodes[o]["visits"])
+            score = self.guidance.remaining(self.graphs.mode(orbit)) + 0.4 * visits
+            if score <= best:
+                best, chosen = score, orbit
+        return chosen
+
+    def _orbit_path_guidance(self) -> int:
+        """An orbit on the incumbent's path."""
+        path = [o for o in {self.graphs.find(o): None for o in self._path} if self.tree.of_orbit.get(o)]
+        return path[int(self.rng.integers(len(path)))] if path else self._modal_frontier()
+
+    def _optimistic_choices(self, mode: Mode) -> list[Choice]:
+        """The most promising transition, and sometimes others for further robots at the same time."""
+        proposals = self.guidance.proposals(mode)
+        if not proposals:
+            return []
+        least = proposals[0][0]
+        ties = [c for score, c in proposals if score <= least + 0.25]
+        out = [ties[int(self.rng.integers(len(ties)))]]
+        return out
+
+    # -- sampling -------------------------------------------------------------------------------------------------
+
+    def _expand_roadmaps(self, orbit: int) -> None:
+        """SampleOrbitInterior and ExpandRoadmaps: every constituent roadmap keeps growing."""
+        for name in self.names:
+            self._add_interior(name, self.options.interior_samples)
+
+    def _add_interior(self, name: str, n: int) -> None:
+        """n samples; half uniform, half around known vertices, where passages matter most; free ones are kept."""
+        roadmap = self.roadmaps[name]
+        world = roadmap.world
+        q = uniform_configurations(world.tool, self.rng, n)
+        known = roadmap.q[self.rng.integers(roadmap.n_vertices, size=n)]
+        near = np.clip(known + self.rng.normal(scale=0.4, size=q.shape), world.chain.lower, world.chain.upper)
+        q = np.where(self.rng.random(n)[:, None] < 0.5, q, near)
+        for x in q[~world.hits(world.rows(q, None, {}))]:
+            roadmap.add_vertex(x)
+
+    def _sample_transitions(self, orbit: int, choices: list[Choice]) -> list[tuple[Candidate, ...]]:
+        """SampleTransitions: new candidates for every choice, combined into simultaneous transitions of A."""
+        mode = self.graphs.mode(orbit)
+        lists = []
+        for choice in choices:
+            known = self._known(mode, choice)
+            # Grow the set while it is small, later in step with its logarithm, for ever.
+            if len(known) < 4 or self.best is not None or self.rng.random() < 0.3 + self.options.persistent:
+                known = [*self._sample(mode, choice), *known]
+            if not known:
+                self.guidance.failures[mode.attachments, choice] += 1
+                return []
+            lists.append(known)
+        if not lists:
+            return []
+        out = []
+        for _ in range(self.options.extensions):
+            pick = tuple(x[self._low_index(len(x))] for x in lists)
+            if pick not in out:
+                out.append(pick)
+        return out
+
+    def _low_index(self, n: int) -> int:
+        """An index below n, earlier ones more likely."""
+        return int(min(n - 1, self.rng.geometric(0.35) - 1))
+
+    def _known(self, mode: Mode, choice: Choice) -> list[Candidate]:
+        if choice.kind == "pick":
+            return self.sampler.picks(mode, choice.robots[0], choice.object)
+        if choice.kind == "place":
+            return self.sampler.places(mode, choice.robots[0], choice.place)
+        return self.sampler.handovers(mode, *choice.robots)
+
+    def _sample(self, mode: Mode, choice: Choice) -> list[Candidate]:
+        n = self.options.transition_samples
+        if choice.kind == "pick":
+            return self.sampler.sample_pick(mode, choice.robots[0], choice.object, n)
+        if choice.kind == "place":
+            return self.sampler.sample_place(mode, choice.robots[0], choice.place, n)
+        return self.sampler.sample_handover(mode, *choice.robots, 2 * n)
+
+    def _discover_adjacent_orbit(self, orbit: int, combination: tuple[Candidate, ...]) -> None:
+        """Note the modal state that a sampled transition leads to."""
+        mode = self.graphs.mode(orbit)
+        self.graphs.discover(mode.replace(*(c.after for c in combination)).state, mode.state)
+
+    # -- tree -----------------------------------------------------------------------------------------------------
+
+    def _extend_tree(self, orbit: int, choices: list[Choice], candidates: list[tuple[Candidate, ...]]) -> None:
+        """Extend the tensor tree: towards the sampled transitions, towards the goal, and at random."""
+        orbit = self.graphs.find(orbit)
+        mode = self.graphs.mode(orbit)
+        reached = False
+        for combination in candidates:
+            near = self._select_tensor_node(orbit)
+            if near is None:
+                return
+            if self._towards(near, combination):
+                reached = True
+                if self.best is None:
+                    break
+        if candidates and not reached:
+            for choice in choices:
+                self.guidance.failures[mode.attachments, choice] += 1
+        if self._objects_done(mode):
+            self._towards_goal(orbit)
+        if self.rng.random() < self.options.persistent:
+            node = self._select_tensor_node(orbit, uniform=True)
+            for _ in range(4):
+                if node is not None:
+                    node = self.steering.random_step(node)
+
+    def _select_tensor_node(self, orbit: int, uniform: bool = False) -> Node | None:
+        """A node of the orbit: usually the one it was entered by at the least cost, else any."""
+        nodes = self.tree.of_orbit.get(orbit)
+        if not nodes:
+            return None
+        if uniform or self.rng.random() < self.options.persistent:
+            return nodes[int(self.rng.integers(len(nodes)))]
+        return min(nodes, key=lambda x: x.cost)
+
+    def _towards(self, near: Node, combination: tuple[Candidate, ...]) -> bool:
+        """Drive the active robots to their transition vertices and change the mode there."""
+        targets = {r: v for c in combination for r, v in c.at.items()}
+        node = self.steering.drive(near, targets)
+        if node is None:
+            return False
+        return self._change_mode(node, combination)
+
+    def _change_mode(self, node: Node, combination: tuple[Candidate, ...]) -> bool:
+        mode = node.mode.replace(*(c.after for c in combination))
+        active = tuple(sorted({r for c in combination for r in c.robots}))
+        if (mode.attachments, node.at) in self._banned:
+            return False
+        if self.validity.stand(mode, dict(zip(self.names, node.at, strict=True)), active) is not None:
+            return False
+        cost = sum(self.problem.cost.transitions.get(c.kind, 0.0) for c in combination)
+        known = self.tree.find(mode, node.at)
+        orbit = self.graphs.add_orbit(mode) if known is None else None
+        transition = Transition(tuple(c.action for c in combination))
+        after = self.tree.insert_transition(node, transition, mode, orbit, cost)
+        self.graphs.transition(node.orbit, after.orbit)
+        self._note_goal(after)
+        return True
+
+    def _towards_goal(self, orbit: int) -> None:
+        """In a mode that satisfies the goal, bring the robots to where they have to end."""
+        near = self._select_tensor_node(orbit)
+        if near is None or not self._goal_vertices:
+            return
+        for name in [str(x) for x in self.rng.permutation(list(self._goal_vertices))]:
+            node = self.steering.drive(near, {name: self._goal_vertices[name]})
+            if node is not None:
+                near = node
+        # Whoever was sent aside comes back at the end.
+        for name, v in self._goal_vertices.items():
+            node = self.steering.drive(near, {name: v}, depth=0)
+            near = node or near
+
+    def _insert(self, node: Node, at: At) -> Node:
+        """InsertAndRewire: a validated step; orbits that it proves connected become one."""
+        new, is_new = self.tree.insert(node, at)
+        if not is_new and new.orbit != node.orbit:
+            kept = self.graphs.merge(new.orbit, node.orbit)
+            self.tree.merge_orbits(kept, new.orbit if new.orbit != kept else node.orbit)
+        self.counts.nodes = len(self.tree.nodes)
+        if is_new:
+            self._note_goal(new)
+        return new
+
+    # -- solutions ------------------------------------------------------------------------------------------------
+
+    def _objects_done(self, mode: Mode) -> bool:
+        return objects_done(self.problem, mode, self.validity.X_WB)
+
+    def _note_goal(self, node: Node) -> None:
+        at = dict(zip(self.names, node.at, strict=True))
+        if all(at[r] == v for r, v in self._goal_vertices.items()) and self._objects_done(node.mode):
+            self._goal_nodes.append(node)
+
+    def _best_solution(self) -> bool:
+        """Extract the cheapest plan of the tree, have it checked, and keep it when it beats the incumbent."""
+        while True:
+            self._goal_nodes = [n for n in self._goal_nodes if n.alive]
+            node = min(self._goal_nodes, key=lambda n: n.cost, default=None)
+            if node is None or node.cost >= self._tree_cost - 1e-9:
+                return False
+            segments, transitions, groups = self.tree.trace(node)
+            plan = Plan(
+                self.problem,
+                segments,
+                transitions,
+                plan_cost(segments, transitions, self.problem.cost),
+                seed=self.seed,
+                versions=versions(),
+            )
+            plan.history = [{"time_s": 0.0, "cost": plan.cost}]
+            report = self._judge(plan)
+            if report.ok:
+                self._tree_cost = node.cost
+                self._path = [g[0].orbit for g in groups]
+                if self.best is not None and plan.cost >= self.best.cost:
+                    return False
+                self._history.append({"time_s": time.perf_counter() - self._clock, "cost": plan.cost})
+                plan.history = list(self._history)
+                plan.counts = self.counts.as_dict()
+                self.best = plan
+                return True
+            self._repair(report, groups)
+
+    def _judge(self, plan: Plan) -> Report:
+        if self._checker is None:
+            self._checker = Checker(self.problem)
+        return self._checker.check(plan)
+
+    def _repair(self, report: Report, groups: list[list[Node]]) -> None:
+        """The judge found what samples had missed: forbid that step, or that change of mode, and cut the tree there."""
+        for violation in report.violations:
+            if violation.kind not in ("collision", "contact") or violation.segment is None:
+                raise MrtampError(f"the planner produced an illegal plan; please report this: {violation}")
+            group = groups[violation.segment]
+            step = violation.step or 0
+            at_end = step >= len(group) - 2 and (violation.fraction or 0.0) > 0.999
+            if at_end and violation.segment + 1 < len(groups):
+                # Fingers that close or open at the transition may be the cause.
+                after = groups[violation.segment + 1][0]
+                self._banned.add((after.mode.attachments, after.at))
+                if after.alive:
+                    self.tree.cut(after)
+            if step + 1 < len(group):
+                before, after = group[step], group[step + 1]
+                guilty = self._guilty(violation, before)
+                maps = [dict(zip(self.names, x.at, strict=True)) for x in (before, after)]
+                self.validity.forbid(before.mode, *maps, guilty)
+                if after.alive:
+                    self.tree.cut(after)
+
+    def _guilty(self, violation: Violation, node: Node) -> tuple[str, ...]:
+        """The one or two robots that a violation is about, loads counted with their carriers."""
+        carriers = {a.object: r for r, a in node.mode.held.items()}
+        owners = [carriers.get(s.owner, s.owner) for s in violation.sides or ()]
+        robots = tuple(dict.fromkeys(o for o in owners if o in self.roadmaps))
+        return robots or tuple(self.names[:1])
+
+    # -- reports --------------------------------------------------------------------------------------------------
+
+    def status(self) -> Status:
+        """A snapshot for progress displays."""
+        remaining = min((self.guidance.remaining(m) for m in self._modes()), default=0.0) if self.best is None else 0.0
+        return Status(
+            phase="first plan" if self.best is None else "improving",
+            iteration=self.iteration,
+            elapsed_s=self._spent,
+            modes=len(self.graphs.modal),
+            orbits=len(self.graphs.orbital),
+            nodes=len(self.tree.nodes),
+            remaining=remaining,
+            cost=self.best.cost if self.best else None,
+        )
+
+    def _modes(self) -> Iterator[Mode]:
+        for orbits in self.graphs.orbits_of.values():
+            if orbits:
+                yield self.graphs.mode(orbits[0])
+
+    def explain(self) -> str:
+        """Why there is no plan yet: per stratum what was tried and what stopped it, and who blocked whose motion."""
+        return ""
+
+
+def versions() -> dict[str, str]:
+    """Versions that a plan depends on."""
+    return {
+        "mrtamp": version("mrtamp"),
+        "drake": version("drake"),
+        "numpy": version("numpy"),
+        "python": platform.python_version(),
+    }

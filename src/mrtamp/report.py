@@ -1,0 +1,125 @@
+"""A plan in words: the timeline of its transitions, its cost and how it came down, what was counted.
+
+The command line prints these texts, the Meshcat page and the notebooks show the same rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from mrtamp.modes import Attachment
+from mrtamp.plan import Plan, measures
+from mrtamp.playback import Playback
+
+
+@dataclass(frozen=True)
+class Row:
+    """One elementary change in the timeline; simultaneous ones share `step` and `time`."""
+
+    step: int
+    time: float
+    kind: str
+    robots: tuple[str, ...]
+    object: str
+    source: str
+    target: str
+
+    @property
+    def sentence(self) -> str:
+        """The change as a short sentence: `left hands red to right`."""
+        if self.kind == "pick":
+            return f"{self.robots[0]} picks {self.object}"
+        if self.kind == "place":
+            return f"{self.robots[0]} places {self.object} {self._at_target()}"
+        if self.kind == "handover" and len(self.robots) == 2:
+            return f"{self.robots[0]} hands {self.object} to {self.robots[1]}"
+        return f"{' and '.join(self.robots)}: {self.kind} {self.object}"
+
+    def _at_target(self) -> str:
+        """The target in a sentence; supports made from exact poses and object tops have names of their own form."""
+        for exact in ("start", "goal"):
+            if self.target == f"{exact} of {self.object}":
+                return f"at its {exact}"
+        return f"on {self.target}"
+
+
+def _where(attachment: Attachment) -> str:
+    """The place of an attachment, in a word or two."""
+    return attachment.place if attachment.held or attachment.support else attachment.parent
+
+
+def timeline(plan: Plan, playback: Playback | None = None) -> list[Row]:
+    """Every change of attachment in order; `time` is when it happens on the clock of `Playback` (s)."""
+    playback = playback or Playback(plan)
+    return [
+        Row(step, event.start, a.kind, a.robots, a.object, _where(a.before), _where(a.after))
+        for step, event in enumerate(playback.events, 1)
+        for a in event.transition.actions
+    ]
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> str:
+    """Plain text columns under a header; the columns in `right` are aligned to the right."""
+    cells = [list(header), *[list(row) for row in rows]]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+    lines = [
+        "  ".join(c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
+        for row in cells
+    ]
+    lines.insert(1, "  ".join("-" * w for w in widths))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def timeline_text(plan: Plan, playback: Playback | None = None) -> str:
+    """The timeline as a table."""
+    rows = [
+        (str(r.step), f"{r.time:.2f} s", r.kind, " -> ".join(r.robots), r.object, f"{r.source} -> {r.target}")
+        for r in timeline(plan, playback)
+    ]
+    if not rows:
+        return "(no transitions: the robots only move)"
+    return table(("step", "time", "kind", "robots", "object", "from -> to"), rows, right=(0, 1))
+
+
+def cost_text(plan: Plan) -> str:
+    """One line: the cost and the two measures it is made of."""
+    m = measures(plan.segments)
+    return f"cost {plan.cost:.3f}  (makespan {m['makespan']:.3f} rad, path length {m['path_length']:.3f} rad)"
+
+
+def history_text(plan: Plan, most: int = 12) -> str:
+    """The incumbents as a table, at most `most` of them: the first, the last, and the largest steps in between."""
+    history = plan.history
+    if not history:
+        return "(no history)"
+    kept = range(len(history))
+    if len(history) > most:
+        gains = [history[i - 1]["cost"] - history[i]["cost"] for i in range(1, len(history) - 1)]
+        largest = sorted(range(len(gains)), key=lambda i: -gains[i])[: most - 2]
+        kept = sorted({0, len(history) - 1, *(i + 1 for i in largest)})  # type: ignore[assignment]
+    rows = [(str(i + 1), f"{history[i]['time_s']:.2f} s", f"{history[i]['cost']:.3f}") for i in kept]
+    text = table(("incumbent", "found after", "cost"), rows, right=(0, 1, 2))
+    left_out = len(history) - len(rows)
+    return text + (f"\n({left_out} smaller improvements not shown)" if left_out else "")
+
+
+def counts_text(plan: Plan) -> str:
+    """One line with everything the planner counted."""
+    return ", ".join(f"{name.replace('_', ' ')} {value:,}" for name, value in plan.counts.items())
+
+
+def summary(plan: Plan) -> dict[str, Any]:
+    """The same facts as JSON-able data."""
+    return {
+        "problem": plan.problem.name,
+        "seed": plan.seed,
+        "cost": plan.cost,
+        **measures(plan.segments),
+        "duration_s": Playback(plan).duration,
+        "timeline": [{**asdict(r), "robots": list(r.robots)} for r in timeline(plan)],
+        "history": plan.history,
+        "counts": plan.counts,
+        "versions": plan.versions,
+    }

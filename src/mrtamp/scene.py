@@ -1,0 +1,321 @@
+"""Problem -> Drake plants: which bodies exist, where they are welded, and how a configuration is written into q.
+
+One function builds every plant the project uses: small ones for the planner (one robot, or two), the full one for the
+judge, and the full one with visuals for Meshcat.  Section III of the paper; DESIGN section 4.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from pydrake.geometry import Box, Capsule, CollisionFilterDeclaration, Cylinder, GeometrySet, SceneGraph, Sphere
+from pydrake.geometry import Shape as DrakeShape
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import PackageMap, Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex, RigidBody, SpatialInertia, UnitInertia
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+
+from mrtamp.kinematics import Chain, Tool, quaternions
+from mrtamp.problem import MovableObject, MrtampError, Problem, Robot, RobotModel, Shape, StaticBody
+
+PACKAGE_PATH_VARIABLE = "MRTAMP_PACKAGE_PATH"
+
+
+def package_map(paths: Iterable[Path]) -> PackageMap:
+    """Packages for `package://` URLs: directories that hold a package.xml, from `paths` and MRTAMP_PACKAGE_PATH.
+
+    Drake's own entry for `drake_models` would download; it is dropped unless a directory provides it.
+    """
+    packages = PackageMap()
+    if packages.Contains("drake_models"):
+        packages.Remove("drake_models")
+    extra = [Path(p) for p in os.environ.get(PACKAGE_PATH_VARIABLE, "").split(os.pathsep) if p]
+    for path in [*paths, *extra]:
+        file = path / "package.xml"
+        if not file.is_file():
+            raise MrtampError(f"package directory {path} has no package.xml")
+        name = ElementTree.parse(file).getroot().findtext("name", "").strip()
+        if not packages.Contains(name):
+            packages.AddPackageXml(str(file))
+    return packages
+
+
+def drake_shape(shape: Shape) -> DrakeShape:
+    """The Drake geometry of a problem's primitive shape."""
+    makers = {"box": Box, "cylinder": Cylinder, "capsule": Capsule, "sphere": Sphere}
+    return makers[shape.kind](*shape.size)
+
+
+@dataclass
+class RobotInScene:
+    """Where one robot lives in a plant: its model instance and the columns of q that are its arm and its fingers."""
+
+    robot: Robot
+    instance: ModelInstanceIndex
+    arm: np.ndarray
+    fingers: np.ndarray
+    finger_factors: np.ndarray
+
+    def finger_positions(self, width: float | None) -> np.ndarray:
+        """Finger joint positions for an opening width (m); None means fully open."""
+        gripper = self.robot.model.gripper
+        if gripper is None:
+            return np.zeros(0)
+        return self.finger_factors * (gripper.max_width if width is None else width)
+
+
+@dataclass
+class Scene:
+    """A finalised plant with its scene graph, and the maps from names to its parts.
+
+    `floating` maps the name of each free body to the first of its seven columns in q (qw, qx, qy, qz, x, y, z).
+    """
+
+    diagram: Diagram
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+    robots: dict[str, RobotInScene]
+    statics: dict[str, list[RigidBody]]
+    floating: dict[str, int] = field(default_factory=dict)
+    free_bodies: dict[str, list[RigidBody]] = field(default_factory=dict)
+
+    def context(self) -> tuple[Context, Context]:
+        """A fresh root context and the plant's context inside it."""
+        root = self.diagram.CreateDefaultContext()
+        return root, self.plant.GetMyMutableContextFromRoot(root)
+
+    def write_pose(self, q: np.ndarray, body: str, X_WF: np.ndarray) -> None:
+        """Write the 4x4 world pose of a free body into the position vector q in place."""
+        k = self.floating[body]
+        q[k : k + 4] = quaternions(X_WF[None, :3, :3])[0]
+        q[k + 4 : k + 7] = X_WF[:3, 3]
+
+
+def parse_robot(parser: Parser, model: RobotModel, name: str) -> ModelInstanceIndex:
+    """Add the robot's URDF or SDF under the instance name `name` and return its (single) model instance."""
+    if model.model.startswith("package://"):
+        instances = parser.AddModelsFromUrl(model.model)
+    else:
+        root = model.file.parent if model.file else Path()
+        instances = parser.AddModels(str((root / model.model).resolve()))
+    if len(instances) != 1:
+        raise MrtampError(f"{model.model}: expected one model, found {len(instances)}")
+    return instances[0]
+
+
+def _add_primitive(plant: MultibodyPlant, body: RigidBody, shape: Shape, color: Sequence[float], visuals: bool) -> None:
+    geometry = drake_shape(shape)
+    plant.RegisterCollisionGeometry(body, RigidTransform(), geometry, "collision", CoulombFriction(0.9, 0.8))
+    if visuals:
+        plant.RegisterVisualGeometry(body, RigidTransform(), geometry, "visual", np.asarray(color))
+
+
+def _inertia(shape: Shape, mass: float) -> SpatialInertia:
+    x = shape.size
+    unit = {
+        "box": lambda: UnitInertia.SolidBox(*x),
+        "cylinder": lambda: UnitInertia.SolidCylinder(x[0], x[1], np.array([0.0, 0.0, 1.0])),
+        "capsule": lambda: UnitInertia.SolidCapsule(x[0], x[1], np.array([0.0, 0.0, 1.0])),
+        "sphere": lambda: UnitInertia.SolidSphere(x[0]),
+    }[shape.kind]()
+    return SpatialInertia(mass, np.zeros(3), unit)
+
+
+def _add_static(plant: MultibodyPlant, parser: Parser, static: StaticBody, visuals: bool) -> list[RigidBody]:
+    if static.shape is not None:
+        instance = plant.AddModelInstance(f"static:{static.name}")
+        body = plant.AddRigidBody(static.name, instance, _inertia(static.shape, 1.0))
+        _add_primitive(plant, body, static.shape, static.color, visuals)
+        plant.WeldFrames(plant.world_frame(), body.body_frame(), static.X_WB)
+        return [body]
+    return _add_model(plant, parser, static.model or "", static.X_WB)
+
+
+def _add_model(plant: MultibodyPlant, parser: Parser, model: str, X_WB: RigidTransform | None) -> list[RigidBody]:
+    """A model file of fixed bodies; welded at X_WB, or left free (an object) when X_WB is None."""
+    url = model.startswith("package://")
+    [instance] = parser.AddModelsFromUrl(model) if url else parser.AddModels(model)
+    bodies = [plant.get_body(i) for i in plant.GetBodyIndices(instance)]
+    if X_WB is not None and not plant.GetJointIndices(instance):
+        plant.WeldFrames(plant.world_frame(), bodies[0].body_frame(), X_WB)
+    elif X_WB is not None:
+        children = {plant.get_joint(j).child_body().name() for j in plant.GetJointIndices(instance)}
+        roots = [b for b in bodies if b.name() not in children]
+        if roots:
+            plant.WeldFrames(plant.world_frame(), roots[0].body_frame(), X_WB)
+    return bodies
+
+
+def build_scene(
+    problem: Problem,
+    *,
+    robots: Sequence[str] | None = None,
+    free_bodies: Mapping[str, MovableObject] | None = None,
+    statics: bool = True,
+    visuals: bool = False,
+    padding: Mapping[str, float] | None = None,
+    builder: DiagramBuilder | None = None,
+) -> Scene:
+    """Build and finalise a plant.
+
+    Parameters
+    ----------
+    robots : names of the robots to include (default: all).
+    free_bodies : free body name -> the object whose shape it has (default: every object under its own name).
+    visuals : keep illustration geometry (planning plants do not need it).
+    padding : robot name -> metres by which its primitive collision shapes grow, fingers and hand excepted.
+    builder : a diagram builder to add the plant to; the caller then builds the diagram (`Scene.diagram` is None).
+
+    Raises
+    ------
+    MrtampError : a model file cannot be read or has an unsupported joint.
+    """
+    own_builder = builder is None
+    builder = builder or DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    parser = Parser(plant)
+    parser.SetAutoRenaming(True)
+    parser.package_map().AddMap(PackageMap.MakeEmpty())
+    if parser.package_map().Contains("drake_models"):
+        parser.package_map().Remove("drake_models")
+    parser.package_map().AddMap(package_map(problem.package_paths))
+
+    included = {name: problem.robot(name) for name in (robots or [r.name for r in problem.robots])}
+    instances: dict[str, ModelInstanceIndex] = {}
+    for name, robot in included.items():
+        instance = parse_robot(parser, robot.model, name)
+        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(robot.model.base, instance), robot.X_WB)
+        instances[name] = instance
+    static_bodies = {s.name: _add_static(plant, parser, s, visuals) for s in problem.statics} if statics else {}
+    free = {o.name: o for o in problem.objects} if free_bodies is None else dict(free_bodies)
+    bodies: dict[str, list[RigidBody]] = {}
+    for name, item in free.items():
+        if item.shape is not None:
+            instance = plant.AddModelInstance(f"object:{name}")
+            body = plant.AddRigidBody(name, instance, _inertia(item.shape, item.mass))
+            _add_primitive(plant, body, item.shape, item.color, visuals)
+            bodies[name] = [body]
+        else:
+            bodies[name] = _add_model(plant, parser, item.model or "", None)
+    plant.Finalize()
+    _filter_exceptions(plant, scene_graph, included, instances)
+    if padding:
+        for name, extra in padding.items():
+            _pad(plant, scene_graph, included[name], instances[name], extra)
+
+    in_scene = {name: _robot_in_scene(plant, robot, instances[name]) for name, robot in included.items()}
+    return Scene(
+        diagram=builder.Build() if own_builder else None,
+        plant=plant,
+        scene_graph=scene_graph,
+        robots=in_scene,
+        statics=static_bodies,
+        floating={name: b[0].floating_positions_start() for name, b in bodies.items()},
+        free_bodies=bodies,
+    )
+
+
+def _robot_in_scene(plant: MultibodyPlant, robot: Robot, instance: ModelInstanceIndex) -> RobotInScene:
+    def columns(names: Iterable[str]) -> np.ndarray:
+        return np.array([plant.GetJointByName(j, instance).position_start() for j in names], dtype=int)
+
+    gripper = robot.model.gripper
+    fingers = gripper.joints if gripper else {}
+    return RobotInScene(
+        robot=robot,
+        instance=instance,
+        arm=columns(robot.model.arm_joints),
+        fingers=columns(fingers),
+        finger_factors=np.array(list(fingers.values()), dtype=float),
+    )
+
+
+def geometry_ids(plant: MultibodyPlant, bodies: Iterable[RigidBody]) -> list:
+    """Collision geometry ids of `bodies`."""
+    return [g for body in bodies for g in plant.GetCollisionGeometriesForBody(body)]
+
+
+def robot_bodies(plant: MultibodyPlant, in_scene: RobotInScene) -> list[RigidBody]:
+    """All bodies of a robot."""
+    return [plant.get_body(i) for i in plant.GetBodyIndices(in_scene.instance)]
+
+
+def gripper_bodies(plant: MultibodyPlant, in_scene: RobotInScene) -> list[RigidBody]:
+    """The bodies of a robot that may touch what it holds."""
+    gripper = in_scene.robot.model.gripper
+    return [plant.GetBodyByName(b, in_scene.instance) for b in gripper.bodies] if gripper else []
+
+
+def _filter_exceptions(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    robots: Mapping[str, Robot],
+    instances: Mapping[str, ModelInstanceIndex],
+) -> None:
+    """Apply the collision exceptions of every robot description; its base may stand on the static world."""
+    manager = scene_graph.collision_filter_manager()
+    for name, robot in robots.items():
+        for a, b in robot.model.collision_exceptions:
+            sets = [GeometrySet(geometry_ids(plant, [plant.GetBodyByName(x, instances[name])])) for x in (a, b)]
+            manager.Apply(CollisionFilterDeclaration().ExcludeBetween(*sets))
+
+
+def _pad(
+    plant: MultibodyPlant, scene_graph: SceneGraph, robot: Robot, instance: ModelInstanceIndex, extra: float
+) -> None:
+    """Grow a robot's primitive collision shapes, so that motion between checked samples is covered too.
+
+    Changing a shape drops the filters Drake had set for it (same body, adjacent bodies): the caller excludes the robot's own
+    pairs again.
+    """
+    source = plant.get_source_id()
+    inspector = scene_graph.model_inspector()
+    gripper = set(robot.model.gripper.bodies) if robot.model.gripper else set()
+    for index in plant.GetBodyIndices(instance):
+        body = plant.get_body(index)
+        if body.name() in gripper or body.name() == robot.model.base:
+            continue
+        for g in plant.GetCollisionGeometriesForBody(body):
+            shape = inspector.GetShape(g)
+            grown: DrakeShape | None = None
+            if isinstance(shape, Sphere):
+                grown = Sphere(shape.radius() + extra)
+            elif isinstance(shape, Capsule):
+                grown = Capsule(shape.radius() + extra, shape.length())
+            elif isinstance(shape, Cylinder):
+                grown = Cylinder(shape.radius() + extra, shape.length() + 2 * extra)
+            elif isinstance(shape, Box):
+                grown = Box(*(shape.size() + 2 * extra))
+            if grown is not None:
+                scene_graph.ChangeShape(source, g, grown)
+
+
+def chain_of(scene: Scene, name: str) -> tuple[Chain, Tool]:
+    """Batched kinematics of robot `name` with open fingers, and its grasp frame."""
+    in_scene = scene.robots[name]
+    model = in_scene.robot.model
+    gripper = model.gripper
+    fixed = {j: f * gripper.max_width for j, f in gripper.joints.items()} if gripper else {}
+    chain = Chain(scene.plant, in_scene.instance, model.base, in_scene.robot.X_WB, model.arm_joints, fixed)
+    return chain, Tool(chain, model.grasp_body, model.X_BG)
+
+
+__all__ = [
+    "PACKAGE_PATH_VARIABLE",
+    "RobotInScene",
+    "Scene",
+    "build_scene",
+    "chain_of",
+    "drake_shape",
+    "geometry_ids",
+    "gripper_bodies",
+    "package_map",
+    "parse_robot",
+    "robot_bodies",
+]

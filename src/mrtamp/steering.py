@@ -1,0 +1,163 @@
+"""GetNeighbor and LazyValidate: which tensor neighbour a node is extended to (paper, algorithm 1; dRRT* oracle).
+
+The informed oracle sends each active robot along its shortest roadmap path, validated lazily in the context of the mode and of
+where the others stand; robots in the way are sent aside first.  The uninformed one takes random tensor neighbours.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from mrtamp.modes import Mode
+from mrtamp.roadmap import Roadmap, lazy_path
+from mrtamp.tensor_tree import At, Node, as_mapping
+from mrtamp.validity import Validity
+
+ROUNDS = 40
+"""Lazy searches per path before the oracle gives up."""
+_ASIDE = 6
+
+Insert = Callable[[Node, At], Node]
+
+
+class Steering:
+    """Extends the tree towards roadmap vertices; every step it takes has been validated."""
+
+    def __init__(
+        self, roadmaps: Sequence[Roadmap], validity: Validity, insert: Insert, rng: np.random.Generator
+    ) -> None:
+        self.roadmaps = list(roadmaps)
+        self.validity = validity
+        self.insert = insert
+        self.rng = rng
+        self.index = {g.name: i for i, g in enumerate(roadmaps)}
+        self.trouble: Counter[tuple[str, str]] = Counter()
+
+    def drive(self, node: Node, targets: dict[str, int], depth: int = 1) -> Node | None:
+        """Bring robots to target vertices, one after another, others standing; None if some cannot get there.
+
+        Robots in the way are first sent aside, up to `depth` levels deep.  Orders of the active robots are tried in turn.
+        """
+        pending = [r for r, v in targets.items() if node.at[self.index[r]] != v]
+        if not pending:
+            return node
+        for first in pending:
+            order = [first, *[r for r in pending if r != first]]
+            at: Node | None = node
+            for robot in order:
+                assert at is not None
+                at = self._go(at, robot, targets[robot], frozenset(targets), depth)
+                if at is None:
+                    break
+            if at is not None and all(at.at[self.index[r]] == v for r, v in targets.items()):
+                return at
+        return None
+
+    def _go(self, node: Node, robot: str, goal: int, keep: frozenset[str], depth: int) -> Node | None:
+        path, blockers = self.path(node.mode, node.at, robot, goal)
+        if path is not None:
+            return self._follow(node, robot, path)
+        if depth <= 0 or not blockers:
+            return None
+        free, _ = self.path(node.mode, node.at, robot, goal, ignore=set(blockers))
+        if free is None:
+            return None
+        for other, _ in blockers.most_common():
+            # A robot that waits at its own target may step aside too; the caller notices and brings it back.
+            moved = self._aside(node, other, robot, free, depth - 1)
+            if moved is None:
+                continue
+            node = moved
+            path, _ = self.path(node.mode, node.at, robot, goal)
+            if path is not None:
+                return self._follow(node, robot, path)
+        return None
+
+    def _aside(self, node: Node, other: str, robot: str, path: list[int], depth: int) -> Node | None:
+        """Send `other` to a vertex from which it does not block `robot`'s path."""
+        roadmap = self.roadmaps[self.index[other]]
+        own = self.roadmaps[self.index[robot]]
+        edges = [own.edge(a, b) for a, b in zip(path[:-1], path[1:], strict=True)]
+        open_vertices = roadmap.open_vertices()
+        random = [open_vertices[i] for i in self.rng.integers(len(open_vertices), size=_ASIDE)]
+        here = node.at[self.index[other]]
+        exits = [v for v in roadmap.exits.get(here, []) if v != here]
+        for v in dict.fromkeys([0, *exits[::-1], *random]):
+            if v == here:
+                continue
+            if not all(self.validity.against(robot, e, node.mode, other, v) for e in edges):
+                continue
+            moved = self._go(node, other, v, frozenset(), depth)
+            if moved is not None:
+                return moved
+        return None
+
+    def path(
+        self, mode: Mode, at: At, robot: str, goal: int, ignore: set[str] | None = None
+    ) -> tuple[list[int] | None, Counter[str]]:
+        """Shortest valid path of one robot while the others stand, and how often each of those was in the way."""
+        roadmap = self.roadmaps[self.index[robot]]
+        start = at[self.index[robot]]
+        roadmap.offer_direct(start, goal)
+        standing = {r: v for r, v in as_mapping(self.roadmaps, at).items() if r != robot and r not in (ignore or ())}
+        blockers: Counter[str] = Counter()
+
+        def validate(e: int) -> bool:
+            if not self.validity.edge(robot, e, mode):
+                self.trouble[robot, "world"] += 1
+                return False
+            for other, v in standing.items():
+                if not self.validity.against(robot, e, mode, other, v):
+                    blockers[other] += 1
+                    self.trouble[robot, other] += 1
+                    return False
+            return True
+
+        for other, v in standing.items():
+            # Verdicts of earlier searches hide behind the mask: they name blockers too.
+            if self.validity.label((robot, mode.held.get(robot), other, v, mode.held.get(other))).hit:
+                blockers[other] += 1
+        blocked = self.validity.blocked(robot, mode, standing)
+        return lazy_path(roadmap, start, goal, blocked, validate, ROUNDS), blockers
+
+    def _follow(self, node: Node, robot: str, path: list[int]) -> Node:
+        i = self.index[robot]
+        for v in path[1:]:
+            node = self.insert(node, (*node.at[:i], v, *node.at[i + 1 :]))
+        return node
+
+    def random_step(self, node: Node) -> Node | None:
+        """A uniformly random tensor neighbour, if the step is valid: every robot may move, at least one does."""
+        at = list(node.at)
+        movers = [i for i in range(len(at)) if self.rng.random() < 0.5]
+        for i in movers or [int(self.rng.integers(len(at)))]:
+            options = self.roadmaps[i].neighbours(at[i])
+            if options:
+                at[i] = options[int(self.rng.integers(len(options)))]
+        new = tuple(at)
+        if new == node.at or not self.step_is_valid(node.mode, node.at, new):
+            return None
+        return self.insert(node, new)
+
+    def step_is_valid(self, mode: Mode, a: At, b: At) -> bool:
+        """LazyValidate: one synchronous step, robots alone first, then every pair of which one moves."""
+        names = [g.name for g in self.roadmaps]
+        moving = [i for i in range(len(a)) if a[i] != b[i]]
+        for i in moving:
+            if not self.validity.edge(names[i], self.roadmaps[i].edge(a[i], b[i]), mode):
+                return False
+        for i in moving:
+            for j in range(len(a)):
+                if j == i or (j in moving and j < i):
+                    continue
+                if j in moving:
+                    if not self.validity.move(mode, names[i], (a[i], b[i]), names[j], (a[j], b[j])):
+                        return False
+                elif not self.validity.against(
+                    names[i], self.roadmaps[i].edge(a[i], b[i]), mode, names[j], a[j]
+                ):
+                    return False
+        return True

@@ -1,0 +1,273 @@
+"""Which roadmap edges are free in which mode: factored and cached answers, computed when first asked for.
+
+A mode's verdict on an edge is the conjunction of factors that outlive the mode: robot and load against the static world,
+against each resting object at its pose, and against each other robot.  A new mode re-checks only what changed in it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mrtamp.collision import Collision, bisection_order
+from mrtamp.modes import Attachment, Mode
+from mrtamp.problem import Problem
+from mrtamp.roadmap import Roadmap
+
+_SLACK = 0.012
+"""Clearance (m) of bounding spheres below which Drake is asked: padding plus half a step."""
+
+
+@dataclass
+class Label:
+    """Edges known to be free, and known to be blocked, with respect to one factor."""
+
+    free: set[int] = field(default_factory=set)
+    hit: set[int] = field(default_factory=set)
+
+    def get(self, e: int) -> bool | None:
+        """True free, False blocked, None unknown."""
+        return True if e in self.free else False if e in self.hit else None
+
+    def put(self, e: int, free: bool) -> None:
+        """Record a verdict, instead of an earlier one if there was any."""
+        (self.hit if free else self.free).discard(e)
+        (self.free if free else self.hit).add(e)
+
+
+@dataclass(frozen=True)
+class Resting:
+    """A resting object of a mode: the chain of attachments that fixes it (the cache key) and its world pose."""
+
+    name: str
+    chain: tuple[Attachment, ...]
+    X_WO: np.ndarray
+
+
+class Validity:
+    """Cached verdicts on edges of all roadmaps."""
+
+    def __init__(self, problem: Problem, collision: Collision, roadmaps: Mapping[str, Roadmap]) -> None:
+        self.collision = collision
+        self.roadmaps = roadmaps
+        self.counts = collision.counts
+        self.X_WB = {s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}
+        self._labels: dict[Hashable, Label] = {}
+        self._moves: dict[Hashable, bool] = {}
+        self._poses: dict[tuple[Attachment, ...], np.ndarray] = {}
+        self._resting: dict[tuple[Attachment, ...], tuple[Resting, ...]] = {}
+        self.blame: Counter[tuple[str, str]] = Counter()
+
+    def label(self, key: Hashable) -> Label:
+        """The label of a factor."""
+        found = self._labels.get(key)
+        if found is None:
+            found = self._labels[key] = Label()
+        return found
+
+    def world_pose(self, chain: tuple[Attachment, ...]) -> np.ndarray:
+        """World pose (4, 4) of an object at rest, from its chain of attachments."""
+        X = self._poses.get(chain)
+        if X is None:
+            base = self.X_WB[chain[0].parent] if len(chain) == 1 else self.world_pose(chain[1:])
+            X = self._poses[chain] = base @ chain[0].X_PO
+        return X
+
+    def resting(self, mode: Mode) -> tuple[Resting, ...]:
+        """The resting objects of a mode."""
+        found = self._resting.get(mode.attachments)
+        if found is None:
+            out = []
+            for a in mode.attachments:
+                if not a.held:
+                    chain = mode.chain(a.object)
+                    out.append(Resting(a.object, chain, self.world_pose(chain)))
+            found = self._resting[mode.attachments] = tuple(out)
+        return found
+
+    def blocked(self, robot: str, mode: Mode, at: Mapping[str, int]) -> np.ndarray:
+        """Edges (E,) of a robot already known to be blocked in `mode` with the other robots standing at `at`."""
+        mask = np.zeros(self.roadmaps[robot].n_edges, dtype=bool)
+        held = mode.held.get(robot)
+        keys: list[Hashable] = [(robot, held, None)]
+        keys += [(robot, held, r.chain) for r in self.resting(mode)]
+        keys += [(robot, held, other, v, mode.held.get(other)) for other, v in at.items() if other != robot]
+        for key in keys:
+            found = self._labels.get(key)
+            if found is not None and found.hit:
+                mask[list(found.hit)] = True
+        return mask
+
+    def edge(self, robot: str, e: int, mode: Mode) -> bool:
+        """Whether the robot, with what it holds, may move along edge e in `mode`, other robots aside."""
+        held = mode.held.get(robot)
+        static = self.label((robot, held, None))
+        verdict = static.get(e)
+        if verdict is False:
+            return False
+        unknown: list[tuple[Resting, Label]] = []
+        for item in self.resting(mode):
+            factor = self.label((robot, held, item.chain))
+            known = factor.get(e)
+            if known is False:
+                return False
+            if known is None:
+                unknown.append((item, factor))
+        unknown = self._cull(robot, e, held, unknown)
+        if verdict is True and not unknown:
+            return True
+        return self._ask(robot, e, held, static, unknown)
+
+    def _cull(
+        self, robot: str, e: int, held: Attachment | None, unknown: list[tuple[Resting, Label]]
+    ) -> list[tuple[Resting, Label]]:
+        """Drop objects that bounding spheres prove to be out of reach of the edge."""
+        if not unknown:
+            return unknown
+        roadmap = self.roadmaps[robot]
+        world = roadmap.world
+        centres, radii = self._spheres(robot, e, held)
+        kept = []
+        for item, factor in unknown:
+            p = item.X_WO[:3, 3]
+            gap = np.linalg.norm(centres - p, axis=2) - radii
+            if gap.min() > world.object_radius[item.name] + _SLACK:
+                factor.put(e, True)
+            else:
+                kept.append((item, factor))
+        return kept
+
+    def _spheres(self, robot: str, e: int, held: Attachment | None) -> tuple[np.ndarray, np.ndarray]:
+        """Bounding spheres of robot and load along an edge: centres (n, B, 3), radii (B,)."""
+        roadmap = self.roadmaps[robot]
+        world = roadmap.world
+        centres, radii = roadmap.spheres(e), world.bounds.radii
+        if held is not None:
+            R, p = world.tool.pose(roadmap.path_samples(e))
+            load = p + R @ held.X_PO[:3, 3]
+            centres = np.concatenate([centres, load[:, None]], axis=1)
+            radii = np.append(radii, world.object_radius[held.object])
+        return centres, radii
+
+    def _ask(
+        self, robot: str, e: int, held: Attachment | None, static: Label, unknown: list[tuple[Resting, Label]]
+    ) -> bool:
+        roadmap = self.roadmaps[robot]
+        world = roadmap.world
+        q = roadmap.path_samples(e)
+        rows = world.rows(q, held, {item.name: item.X_WO for item, _ in unknown})
+        rows = rows[bisection_order(len(rows))]
+        contact, slot = None, None
+        if held is not None and e in roadmap.contact and roadmap.contact[e][0] == held.object:
+            contact, slot = roadmap.contact[e][1], world.slot_of[held.object]
+        self.counts.edges_validated += 1
+        i = world.first_hit(rows, contact, slot)
+        if i < 0:
+            static.put(e, True)
+            for _, factor in unknown:
+                factor.put(e, True)
+            return True
+        names = {x for pair in world.culprits(rows[i], contact, slot) for x in pair}
+        guilty = [(item, factor) for item, factor in unknown if item.name in names]
+        for item, factor in guilty:
+            factor.put(e, False)
+            self.blame[robot, item.name] += 1
+        if not guilty:
+            static.put(e, False)
+            self.blame[robot, "static"] += 1
+        return False
+
+    def against(self, robot: str, e: int, mode: Mode, other: str, v: int) -> bool:
+        """Whether the robot may move along edge e while `other` stands at its vertex v."""
+        held, other_held = mode.held.get(robot), mode.held.get(other)
+        factor = self.label((robot, held, other, v, other_held))
+        known = factor.get(e)
+        if known is not None:
+            return known
+        stand = self.roadmaps[other].edge(v, v)
+        free = self._apart(robot, e, held, other, stand, other_held, False)
+        factor.put(e, free)
+        if not free:
+            self.blame[robot, other] += 1
+        return free
+
+    def move(self, mode: Mode, a: str, edge_a: tuple[int, int], b: str, edge_b: tuple[int, int]) -> bool:
+        """Whether two robots may move along directed edges (from, to) at the same time."""
+        if a > b:
+            a, edge_a, b, edge_b = b, edge_b, a, edge_a
+        held_a, held_b = mode.held.get(a), mode.held.get(b)
+        key = (a, edge_a, held_a, b, edge_b, held_b)
+        known = self._moves.get(key)
+        if known is None:
+            ea, eb = self.roadmaps[a].edge(*edge_a), self.roadmaps[b].edge(*edge_b)
+            opposed = (edge_a[0] > edge_a[1]) != (edge_b[0] > edge_b[1])
+            known = self._moves[key] = self._apart(a, ea, held_a, b, eb, held_b, opposed)
+        return known
+
+    def _apart(
+        self, a: str, ea: int, held_a: Attachment | None, b: str, eb: int, held_b: Attachment | None, opposed: bool
+    ) -> bool:
+        """Synchronous motion of two robots along edges; `opposed`: they are stored in opposite directions of travel."""
+        na, nb = self.roadmaps[a].n_samples(ea), self.roadmaps[b].n_samples(eb)
+        ca, ra = self._spheres(a, ea, held_a)
+        cb, rb = self._spheres(b, eb, held_b)
+        reach = ra[None, :, None] + rb[None, None, :] + _SLACK
+        if nb == 1 or na == 1:
+            gap = np.linalg.norm(ca[:, :, None] - cb[:, None], axis=3) - reach
+            close = np.flatnonzero(gap.min(axis=(1, 2)) < 0)
+            n = max(na, nb)
+        else:
+            low_a, high_a = (ca - ra[:, None]).min(axis=(0, 1)), (ca + ra[:, None]).max(axis=(0, 1))
+            low_b, high_b = (cb - rb[:, None]).min(axis=(0, 1)), (cb + rb[:, None]).max(axis=(0, 1))
+            if np.any(low_a > high_b + _SLACK) or np.any(low_b > high_a + _SLACK):
+                return True
+            n = max(na, nb)
+            rows_b = np.arange(n)[::-1] if opposed else np.arange(n)
+            ia = np.round(np.arange(n) * (na - 1) / (n - 1)).astype(int)
+            ib = np.round(rows_b * (nb - 1) / (n - 1)).astype(int)
+            gap = np.linalg.norm(ca[ia][:, :, None] - cb[ib][:, None], axis=3) - reach
+            # The coarser robot's spheres are read at the nearest sample, up to half a step away.
+            close = np.flatnonzero(gap.min(axis=(1, 2)) < 0.01)
+        if not len(close):
+            return True
+        qa = self.roadmaps[a].path_samples(ea, n)
+        qb = self.roadmaps[b].path_samples(eb, n)
+        if opposed:
+            qb = qb[::-1]
+        close = close[bisection_order(len(close))]
+        pair, swapped = self.collision.pair(a, b)
+        if swapped:
+            return pair.first_hit(qb[close], held_b, qa[close], held_a) < 0
+        return pair.first_hit(qa[close], held_a, qb[close], held_b) < 0
+
+    def stand(self, mode: Mode, at: Mapping[str, int], robots: tuple[str, ...]) -> str | None:
+        """None if `robots` may stand at their vertices among all others in `mode`; else who is in the way."""
+        for robot in robots:
+            e = self.roadmaps[robot].edge(at[robot], at[robot])
+            if not self.edge(robot, e, mode):
+                return "world"
+            for other, v in at.items():
+                if other != robot and not self.against(robot, e, mode, other, v):
+                    return other
+        return None
+
+    def forbid(self, mode: Mode, a: Mapping[str, int], b: Mapping[str, int], guilty: tuple[str, ...]) -> None:
+        """Record that the step from vertices a to b collides after all; `guilty` names one robot or two."""
+        edges = {r: self.roadmaps[r].edge(a[r], b[r]) for r in guilty}
+        if len(guilty) == 1:
+            [robot] = guilty
+            self.label((robot, mode.held.get(robot), None)).put(edges[robot], False)
+            return
+        one, two = sorted(guilty)
+        moving = [r for r in (one, two) if a[r] != b[r]]
+        if len(moving) == 2:
+            key = (one, (a[one], b[one]), mode.held.get(one), two, (a[two], b[two]), mode.held.get(two))
+            self._moves[key] = False
+            return
+        for robot in moving or [one]:
+            other = two if robot == one else one
+            key = (robot, mode.held.get(robot), other, a[other], mode.held.get(other))
+            self.label(key).put(edges[robot], False)

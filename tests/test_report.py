@@ -1,0 +1,60 @@
+"""A plan in words."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from sketches import sketch
+
+from mrtamp import report
+from mrtamp.plan import Plan
+from mrtamp.playback import standstill
+from mrtamp.problem_file import load_problem
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    return sketch(load_problem("pick_place", robots=2, objects=2))
+
+
+def test_timeline_names_what_changes_and_when(plan: Plan) -> None:
+    rows = report.timeline(plan)
+    assert [(r.step, r.kind, r.robots, r.target) for r in rows] == [
+        (1, "pick", ("arm1",), "arm1"),
+        (2, "handover", ("arm1", "arm2"), "arm2"),
+        (3, "place", ("arm2",), rows[0].source),
+    ]
+    assert [r.time for r in rows] == sorted(r.time for r in rows)
+    assert rows[0].sentence == "arm1 picks cube1"
+    assert rows[1].sentence == "arm1 hands cube1 to arm2"
+    assert rows[2].sentence == "arm2 places cube1 at its start"
+
+
+def test_text_has_aligned_columns(plan: Plan) -> None:
+    lines = report.timeline_text(plan).splitlines()
+    assert len(lines) == 2 + len(plan.transitions)
+    column = lines[0].index("robots")
+    assert [line[column:].split()[0] for line in lines[2:]] == ["arm1", "arm1", "arm2"]
+
+
+def test_a_plan_without_transitions_has_words_too(plan: Plan) -> None:
+    still = standstill(plan.problem)
+    assert "only move" in report.timeline_text(still)
+    assert report.history_text(still) == "(no history)"
+
+
+def test_long_history_keeps_first_last_and_largest_gains(plan: Plan) -> None:
+    costs = [20.0, 19.9, 15.0, 14.9, 14.8, 9.0, 8.95, 8.9]
+    plan.history[:] = [{"time_s": float(i), "cost": c} for i, c in enumerate(costs)]
+    text = report.history_text(plan, most=4)
+    assert [line.split()[-1] for line in text.splitlines()[2:6]] == ["20.000", "15.000", "9.000", "8.900"]
+    assert "4 smaller improvements" in text
+    assert "not shown" not in report.history_text(plan, most=8)
+
+
+def test_summary_is_json(plan: Plan) -> None:
+    data = json.loads(json.dumps(report.summary(plan)))
+    assert data["problem"] == plan.problem.name
+    assert [row["kind"] for row in data["timeline"]] == ["pick", "handover", "place"]
+    assert data["makespan"] <= data["path_length"]
