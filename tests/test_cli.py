@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -208,6 +209,22 @@ def test_a_signal_before_the_first_plan_is_exit_1(tmp_path: Path) -> None:
     assert "without a plan" in stdout
     assert "Traceback" not in stderr
     assert not out.exists()
+
+
+def test_live_window_says_where_it_is_and_ends_with_a_signal(planned: Path) -> None:
+    process = start("view", str(planned))
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line.startswith("open http://localhost:")
+        with urllib.request.urlopen(line.split()[1], timeout=10) as page:
+            assert b"MeshCat" in page.read()
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert process.returncode == 0, stderr
+    assert "Traceback" not in stderr
 
 
 def test_a_closed_pipe_is_not_an_error() -> None:

@@ -259,7 +259,7 @@ class Checker:
     def _landings(
         self, plan: Plan, lines: list[Timeline], judge: MotionJudge, report: Report
     ) -> list[dict[tuple[str, str], tuple[float, float]]]:
-        """Per segment, (object, support) -> the stretch of s in which an object still to be placed must not touch it."""
+        """Per segment, (object, support) -> the stretch of s in which an object yet to be placed must not touch."""
         out: list[dict[tuple[str, str], tuple[float, float]]] = [{} for _ in lines]
         landing: dict[str, Contact] = {}
         for k in reversed(range(len(plan.transitions))):

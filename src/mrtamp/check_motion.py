@@ -6,10 +6,10 @@ the bound on its relative displacement.  Pairs that this does not settle are bis
 `resolution` of relative displacement apart.
 
 Contact is allowed in four cases only.  What a robot holds may touch its gripper; an object at rest may touch what it
-rests on; an object that was just picked may touch what it stood on until they are TOUCH apart for the first time; and one
-that is about to be placed may touch what it will stand on since they were TOUCH apart for the last time.  In the last two
-cases they penetrate no deeper than TOUCH, and the object stays within CONTACT_TRAVEL of the pose in which it rested or
-will rest, so that nothing is dragged along a surface.
+rests on; an object that was just picked may touch what it stood on until they are TOUCH apart for the first time; and
+one that is about to be placed may touch what it will stand on since they were TOUCH apart for the last time.  In the
+last two cases they penetrate no deeper than TOUCH, and the object stays within CONTACT_TRAVEL of the pose in which it
+rested or will rest, so that nothing is dragged along a surface.
 """
 
 from __future__ import annotations

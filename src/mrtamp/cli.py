@@ -221,7 +221,9 @@ def _serve(what: Plan | Problem, options: argparse.Namespace) -> None:
             stream = sys.stderr if getattr(options, "json", False) else sys.stdout
             print(f"open {viewer.url} in a browser; Ctrl-C ends", file=stream, flush=True)
             if viewer.duration > 0:
-                print("space: play or pause; 'Open Controls' has the time slider and every step", file=stream, flush=True)
+                print(
+                    "space: play or pause; 'Open Controls' has the time slider and every step", file=stream, flush=True
+                )
             viewer.run()
         except KeyboardInterrupt:
             pass

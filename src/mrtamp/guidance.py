@@ -18,6 +18,10 @@ from mrtamp.transitions.sampler import StratumKey, TransitionSampler
 
 FAILED_CALL = 3.0
 """What a sampling call without any accepted sample adds to the optimistic cost of its edge."""
+SOFT_FAILURE = 0.3
+"""The same for a call in which IK succeeded; at most FAILED_CALL in all."""
+FAILED_TRY = 0.7
+"""What a failure of a transition in one mode adds to it there."""
 UNREACHABLE = 6.0
 """Cost added before any attempt where the place lies outside the reach that was seen of the robot."""
 
@@ -63,6 +67,9 @@ class ModalGuidance:
             return 1.0 + self._prior(choice)
         if outcome.accepted:
             return 1.0
+        if outcome.ik_solved:
+            # Reachable, but in the way of something so far: that may depend on the grasp.
+            return 1.0 + min(SOFT_FAILURE * outcome.calls, FAILED_CALL)
         return 1.0 + FAILED_CALL * outcome.calls + self._prior(choice)
 
     def _prior(self, choice: Choice) -> float:
@@ -166,6 +173,7 @@ class ModalGuidance:
         out = []
         blockers = self._blockers(mode)
         enabled = self.enabled(mode)
+        reserved = self._reserved(mode)
         for choice in enabled:
             item = choice.object
             start, end = _ends(choice)
@@ -179,8 +187,22 @@ class ModalGuidance:
             if item in blockers or (start in self.goal_places(item) and choice.kind == "pick"):
                 # Out of the way, to anywhere.
                 detour = min(detour, 1.0)
-            out.append((max(detour, 0.0) + self._not_yet(mode, choice) + 1.5 * failed, choice))
+            if end in reserved and reserved[end] != item:
+                # That hand is about to take something else over.
+                detour += 3.0
+            out.append((max(detour, 0.0) + self._not_yet(mode, choice) + FAILED_TRY * failed, choice))
         out.sort(key=lambda pair: pair[0])
+        return out
+
+    def _reserved(self, mode: Mode) -> dict[str, str]:
+        """Robots that the best path of a held object hands it to, and that object."""
+        out = {}
+        for robot, a in mode.held.items():
+            costs = self.costs_to_goal(a.object)
+            options = [c for c in self._choices(a.object) if c.kind != "pick" and c.robots[0] == robot]
+            best = min(options, key=lambda c: self.edge_cost(c) + costs.get(_ends(c)[1], np.inf), default=None)
+            if best is not None and best.kind == "handover":
+                out[best.robots[1]] = a.object
         return out
 
     def _not_yet(self, mode: Mode, choice: Choice) -> float:

@@ -29,6 +29,10 @@ from mrtamp.transitions.sampler import Candidate, TransitionSampler
 from mrtamp.validity import Validity
 
 
+_PATIENCE = 4
+"""Failures of a transition in a mode after which guidance no longer insists on promising candidates."""
+
+
 @dataclass(frozen=True)
 class Options:
     """Settings of the planner.
@@ -43,7 +47,7 @@ class Options:
     interior_samples: int = 4
     transition_samples: int = 48
     extensions: int = 3
-    persistent: float = 0.15
+    persistent: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -248,10 +252,14 @@ class Planner:
         mode = self.graphs.mode(orbit)
         lists = []
         for choice in choices:
+            failed = self.guidance.failures[mode.attachments, choice]
+            guided = len(choices) == 1 and failed < _PATIENCE
             known = self._known(mode, choice)
+            if guided:
+                known = [c for c in known if c.promising]
             # Grow the set while it is small, later in step with its logarithm, for ever.
             if len(known) < 4 or self.best is not None or self.rng.random() < 0.3 + self.options.persistent:
-                known = [*self._sample(mode, choice), *known]
+                known = [*(c for c in self._sample(mode, choice) if c.promising or not guided), *known]
             if not known:
                 self.guidance.failures[mode.attachments, choice] += 1
                 return []

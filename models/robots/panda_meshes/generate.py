@@ -32,9 +32,10 @@ class Part:
 
 
 def ring(
-    centre: Sequence[float], u: np.ndarray, v: np.ndarray, a: float, b: float, exponent: float = 2.0
+    centre: Sequence[float] | np.ndarray, u: np.ndarray, v: np.ndarray, axes: tuple[float, float], exponent: float = 2.0
 ) -> np.ndarray:
-    """Superellipse |s/a|^e + |t/b|^e = 1 in the plane spanned by u, v: (SIDES, 3). Exponent 2 is an ellipse."""
+    """Superellipse |s/a|^e + |t/b|^e = 1 with half axes a, b along u, v: (SIDES, 3). Exponent 2 is an ellipse."""
+    a, b = axes
     angle = 2 * np.pi * np.arange(SIDES) / SIDES
     c, s = np.cos(angle), np.sin(angle)
     power = 2 / exponent
@@ -63,9 +64,9 @@ def loft(colour: str, rings: Sequence[np.ndarray]) -> Part:
 def revolve(
     colour: str, axis: np.ndarray, profile: Iterable[tuple[float, float]], origin: Sequence[float] = (0, 0, 0)
 ) -> Part:
-    """Surface of revolution about a coordinate axis through origin; the profile lists (position on the axis, radius)."""
+    """Surface of revolution about a coordinate axis; the profile lists (position on the axis, radius)."""
     u, v = np.roll(axis, 1), np.roll(axis, 2)
-    return loft(colour, [ring(np.asarray(origin) + s * axis, u, v, r, r) for s, r in profile])
+    return loft(colour, [ring(np.asarray(origin) + s * axis, u, v, (r, r)) for s, r in profile])
 
 
 def stack(
@@ -76,7 +77,7 @@ def stack(
     return loft(
         colour,
         [
-            ring(s * axis + (u0 + u1) / 2 * u + (v0 + v1) / 2 * v, u, v, (u1 - u0) / 2, (v1 - v0) / 2, exponent)
+            ring(s * axis + (u0 + u1) / 2 * u + (v0 + v1) / 2 * v, u, v, ((u1 - u0) / 2, (v1 - v0) / 2), exponent)
             for s, u0, u1, v0, v1 in sections
         ],
     )
@@ -90,7 +91,7 @@ def pipe(colour: str, stations: Iterable[tuple[tuple[float, float, float], tuple
         # u follows from a fixed reference so that neighbouring rings do not twist against each other.
         u = np.cross(Y, w) if abs(w @ Y) < 0.9 else np.cross(w, Z)
         u /= np.linalg.norm(u)
-        rings.append(ring(centre, u, np.cross(w, u), radius, radius))
+        rings.append(ring(centre, u, np.cross(w, u), (radius, radius)))
     return loft(colour, rings)
 
 
@@ -237,7 +238,7 @@ def link7() -> list[Part]:
     def bar(colour: str, sections: Sequence[tuple[float, float, float, float]]) -> Part:
         """Loft along d; a section is (distance from the axis, half width, lowest z, highest z)."""
         return loft(
-            colour, [ring(s * d + (lo + hi) / 2 * Z, side, Z, a, (hi - lo) / 2, 6.0) for s, a, lo, hi in sections]
+            colour, [ring(s * d + (lo + hi) / 2 * Z, side, Z, (a, (hi - lo) / 2), 6.0) for s, a, lo, hi in sections]
         )
 
     return [
@@ -287,7 +288,7 @@ def finger() -> list[Part]:
 
 
 def corner_normals(part: Part) -> np.ndarray:
-    """Unit normal of every face corner, (m, 3, 3): the mean over the faces that meet there at less than the crease angle."""
+    """Unit normals (m, 3, 3) of the face corners: the mean over adjacent faces within the crease angle."""
     a, b, c = (part.vertices[part.faces[:, k]] for k in range(3))
     scaled = np.cross(b - a, c - a)
     flat = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-15)

@@ -30,6 +30,10 @@ LIFT = (0.04, 0.12, 0.22)
 """Distances (m) of the lift vertices along the support's normal, where the hand does not come from there."""
 _CHAIN_JUMP = 1.0
 _GRASP_DRAWS = 8
+_EXCHANGE_SAMPLES = 8
+_SEEDS = 3
+_POOL = 48
+"""Grasps per robot and object that are known to lead on to the goal; enough to choose from."""
 _ROOM = 0.3
 """Distance (m) between two palms beyond which more does not help."""
 _PALM = 0.08
@@ -42,7 +46,8 @@ class Candidate:
     """An elementary transition that stands on roadmap vertices.
 
     `at` maps each active robot to its contact vertex.  `base` is the chain of attachments of the object it is placed
-    on or picked from (empty for a static body): the candidate exists only while that object is there.
+    on or picked from (empty for a static body): the candidate exists only while that object is there.  `promising` is
+    the sampler's guess that what is gained can be put down at its goal; guidance prefers such candidates.
     """
 
     kind: str
@@ -51,6 +56,7 @@ class Candidate:
     before: Attachment
     after: Attachment
     base: tuple[Attachment, ...] = ()
+    promising: bool = True
 
     @property
     def object(self) -> str:
@@ -100,6 +106,7 @@ class TransitionSampler:
         self._handovers: dict[tuple[Attachment, str], list[Candidate]] = {}
         self._fixed: dict[tuple[str, int], Attachment] = {}
         self._grasps: dict[tuple[str, str, int], Attachment] = {}
+        self._pools: dict[tuple[str, str], list[Attachment]] = {}
         self.families: dict[tuple[str, str], list[GraspFamily]] = {}
         self.reach: dict[str, tuple[np.ndarray, float]] = {}
         for robot in problem.robots:
@@ -187,15 +194,22 @@ class TransitionSampler:
         grasps = [self._grasp(robot, item, strata[f].family, f, c[i]) for i, f in enumerate(family)]
         reward = self._look_ahead(mode, robot, item, grasps, q)
         near = np.linalg.norm(q - self.roadmaps[robot].world.home, axis=1)
-        if not np.isfinite(reward).any() and self.goal_supports[item]:
+        promising = np.isfinite(reward)
+        if not promising.any() and self.goal_supports[item]:
+            promising[:] = True
             # Somebody else will have to take it over: a grasp that leaves room for a second hand is worth a detour.
-            near = near - 30.0 * self._room(item, grasps)
+            for other in self.roadmaps:
+                if other != robot:
+                    self._grow_pool(mode, other, item)
+            near = near - 30.0 * self._room(item, robot, grasps)
         order = self._mixed_order(near + np.where(np.isfinite(reward), reward, 50.0))
         out: list[Candidate] = []
         for i in order[: 4 * keep]:
             v = self._contact(robot, placement, chain, grasps[i], q[i], stats)
             if v is not None:
-                candidate = Candidate("pick", (robot,), {robot: v}, placement, grasps[i], chain[1:])
+                candidate = Candidate(
+                    "pick", (robot,), {robot: v}, placement, grasps[i], chain[1:], bool(promising[i])
+                )
                 self._picks.setdefault((robot, chain), []).append(candidate)
                 back = Candidate("place", (robot,), {robot: v}, grasps[i], placement, chain[1:])
                 self._places.setdefault((robot, grasps[i]), []).append(back)
@@ -248,28 +262,39 @@ class TransitionSampler:
         stats.calls += 1
         if not strata:
             return []
-        qa = self._giving_poses(giver, receiver, grasp, n)
+        self._grow_pool(mode, receiver, item)
+        qa, grasps = self._meetings(giver, receiver, grasp, n)
         if not len(qa):
             return []
         stats.samples += len(qa)
         tool = self.roadmaps[receiver].world.tool
         X_WO = self.roadmaps[giver].world.tool.matrix(qa) @ grasp.X_PO
-        family, choices, X_OG = self._receiving_grasps(receiver, strata, X_WO, grasp)
-        qb, solved = self._ik(receiver, X_WO @ X_OG, mixed_seeds(tool, self.rng, len(qa), self._near(receiver)))
+        X_OG = inverse(np.array([g.X_PO for g in grasps]))
+        # Most meeting places are near the edge of both arms' reach: several seeds each.
+        X_WG = np.repeat(X_WO @ X_OG, _SEEDS, axis=0)
+        seeds = mixed_seeds(tool, self.rng, len(X_WG), self._near(receiver))
+        found, each = (x.reshape(len(qa), _SEEDS, -1) for x in self._ik(receiver, X_WG, seeds))
+        solved = each[:, :, 0].any(axis=1)
+        qb = found[np.arange(len(qa)), np.argmax(each[:, :, 0], axis=1)]
         stats.ik_solved += int(solved.sum())
         rows = np.flatnonzero(solved)
-        grasps = [self._grasp(receiver, item, strata[family[i]].family, int(family[i]), choices[i]) for i in rows]
+        grasps = [grasps[i] for i in rows]
         reward = self._look_ahead(mode, receiver, item, grasps, qb[rows])
         homes = [self.roadmaps[r].world.home for r in (giver, receiver)]
         near = np.linalg.norm(qa[rows] - homes[0], axis=1) + np.linalg.norm(qb[rows] - homes[1], axis=1)
         out: list[Candidate] = []
-        if not np.isfinite(reward).any():
+        promising = np.isfinite(reward)
+        if not self._pools.get((receiver, item)):
+            promising[:] = True
+        elif not promising.any():
             # Nothing here can be put down where it belongs: one such handover is enough.
             keep = 1
         for k in self._mixed_order(near + np.where(np.isfinite(reward), reward, 50.0))[: 8 * keep]:
             at = self._exchange(mode, giver, receiver, grasp, grasps[k], qa[rows[k]], qb[rows[k]], stats)
             if at is not None:
-                candidate = Candidate("handover", (giver, receiver), at, grasp, grasps[k])
+                candidate = Candidate(
+                    "handover", (giver, receiver), at, grasp, grasps[k], promising=bool(promising[k])
+                )
                 self._handovers.setdefault((grasp, receiver), []).append(candidate)
                 out.append(candidate)
                 stats.accepted += 1
@@ -400,72 +425,82 @@ class TransitionSampler:
                 reward[i] = np.linalg.norm(found[i] - q[i])
         return reward
 
-    def _giving_poses(self, giver: str, receiver: str, grasp: Attachment, n: int) -> np.ndarray:
-        """Configurations of the giver that hold the object where the receiver may reach it.
+    def _meetings(
+        self, giver: str, receiver: str, grasp: Attachment, n: int
+    ) -> tuple[np.ndarray, list[Attachment]]:
+        """Configurations of the giver, and a grasp for the receiver at each, where the two may meet.
 
-        Half are uniform in the giver's joints (positive density over the whole stratum), half aim at the space between
-        the two robots with a random orientation.
+        A quarter is uniform in the giver's joints and over the receiver's whole grasp family: positive density over the whole
+        stratum.  The rest puts the object between the robots, each hand on its own robot's side, turned freely about the
+        line between the hands.
         """
         world = self.roadmaps[giver].world
         tool = world.tool
-        uniform = uniform_configurations(tool, self.rng, 8 * n)
-        p = tool.matrix(uniform) @ grasp.X_PO
-        centre, radius = self.reach[receiver]
-        uniform = uniform[np.linalg.norm(p[:, :3, 3] - centre, axis=1) <= 0.9 * radius][: n // 2]
-        own = self.reach[giver][0]
-        middle = (own + centre) / 2
-        gap = np.linalg.norm(own - centre)
-        where = middle + self.rng.normal(scale=0.12 + 0.1 * gap, size=(n, 3))
-        R = _random_rotations(self.rng, n)
-        if gap > 1e-6:
-            # Half of those point the giver's hand towards the receiver, turned freely about that direction.
-            ahead = (centre - own) / gap
-            R[::2] = _rotations_about(ahead, self.rng.uniform(-np.pi, np.pi, size=len(R[::2])))
-            R[::2] = _random_rotations(self.rng, len(R[::2]), 0.4) @ R[::2]
-        q, solved = self._ik(giver, matrix(R, where), mixed_seeds(tool, self.rng, n, self._near(giver)))
+        own, centre = self.reach[giver][0], self.reach[receiver][0]
+        uniform = uniform_configurations(tool, self.rng, 4 * n)
+        p = (tool.matrix(uniform) @ grasp.X_PO)[:, :3, 3]
+        uniform = uniform[np.linalg.norm(p - centre, axis=1) <= 0.9 * self.reach[receiver][1]][: n // 4]
+        families = self.families[receiver, grasp.object]
+        free = [
+            self._draw_grasp(receiver, grasp.object, int(f)) for f in self.rng.integers(len(families), size=len(uniform))
+        ]
+        aimed = self._receiving_grasps(receiver, grasp, n)
+        gap = float(np.linalg.norm(centre - own))
+        where = (own + centre) / 2 + self.rng.normal(scale=0.08 + 0.08 * gap, size=(n, 3))
+        X_OG1 = inverse(grasp.X_PO)
+        X_OG2 = inverse(np.array([g.X_PO for g in aimed]))
+        across = _palms(X_OG2) - _palms(X_OG1)
+        ahead = (centre - own) / max(gap, 1e-9)
+        turn = _rotations_about(ahead, self.rng.uniform(-np.pi, np.pi, size=n))
+        R = _random_rotations(self.rng, n, 0.4) @ turn @ np.swapaxes(_rotations_to(across), 1, 2)
+        middle = (X_OG1[:3, 3] + X_OG2[:, :3, 3]) / 2
+        X_WO = matrix(R, where - np.einsum("nij,nj->ni", R, middle))
+        q, solved = self._ik(giver, X_WO @ X_OG1, mixed_seeds(tool, self.rng, n, self._near(giver)))
         qa = np.concatenate([q[solved], uniform])
-        rows = world.rows(qa, grasp, {})
-        return qa[~world.hits(rows)] if len(qa) else qa
+        grasps = [*(g for g, ok in zip(aimed, solved, strict=True) if ok), *free]
+        clear = ~world.hits(world.rows(qa, grasp, {}))
+        return qa[clear], [g for g, ok in zip(grasps, clear, strict=True) if ok]
 
-    def _room(self, item: str, grasps: Sequence[Attachment]) -> np.ndarray:
-        """Largest distance (m) of another hand's palm from the palm of each grasp, over some drawn grasps; at most _ROOM."""
-        families = next((f for (_, name), f in self.families.items() if name == item and f), [])
-        drawn = [f.pose(self.rng.uniform(f.lower, f.upper, size=(4, len(f.lower)))) for f in families]
-        X = np.concatenate(drawn)
-        palms = X[:, :3, 3] - _PALM * X[:, :3, 2]
-        X_OG = inverse(np.array([g.X_PO for g in grasps]))
-        own = X_OG[:, :3, 3] - _PALM * X_OG[:, :3, 2]
+    def _receiving_grasps(self, receiver: str, given: Attachment, n: int) -> list[Attachment]:
+        """n grasps that keep the two hands apart, each the best of a few drawn: mostly of those that lead on to the goal."""
+        item = given.object
+        families = self.families[receiver, item]
+        pool = self._pools.get((receiver, item), [])
+        other = _palms(inverse(given.X_PO))
+        out = []
+        for _ in range(n):
+            if pool and self.rng.random() < 0.8:
+                drawn = [pool[int(k)] for k in self.rng.integers(len(pool), size=_GRASP_DRAWS)]
+            else:
+                drawn = [
+                    self._draw_grasp(receiver, item, int(f)) for f in self.rng.integers(len(families), size=_GRASP_DRAWS)
+                ]
+            apart = np.linalg.norm(_palms(inverse(np.array([g.X_PO for g in drawn]))) - other, axis=1)
+            out.append(drawn[int(np.argmax(np.minimum(apart, _ROOM)))])
+        return out
+
+    def _room(self, item: str, robot: str, grasps: Sequence[Attachment]) -> np.ndarray:
+        """Largest distance (m) from the palm of each grasp to that of another robot's grasp that leads on; at most _ROOM."""
+        others = [g for (name, o), pool in self._pools.items() if o == item and name != robot for g in pool]
+        palms = _palms(inverse(np.array([g.X_PO for g in others or grasps])))
+        own = _palms(inverse(np.array([g.X_PO for g in grasps])))
         return np.minimum(np.linalg.norm(own[:, None] - palms, axis=2).max(axis=1), _ROOM)
 
-    def _receiving_grasps(
-        self, receiver: str, strata: Sequence[Stratum], X_WO: np.ndarray, given: Attachment
-    ) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-        """A grasp for the receiver at each object pose: family (N,), choices, X_OG (N, 4, 4).
+    def _grow_pool(self, mode: Mode, robot: str, item: str, n: int = 32) -> None:
+        """Draw grasps with which `robot` can put the object down at its goal, however it comes by it."""
+        pool = self._pools.setdefault((robot, item), [])
+        families = self.families[robot, item]
+        if len(pool) >= _POOL or not families or not self.goal_supports[item]:
+            return
+        drawn = self.rng.integers(len(families), size=n)
+        grasps = [self._draw_grasp(robot, item, int(f)) for f in drawn]
+        world = self.roadmaps[robot].world
+        reward = self._look_ahead(mode, robot, item, grasps, np.tile(world.home, (n, 1)))
+        pool += [g for g, r in zip(grasps, reward, strict=True) if np.isfinite(r)]
 
-        Of a few drawn, usually the one that keeps the two hands apart and comes from the receiver's side; one in four is
-        the first drawn, so that the whole family keeps positive density.
-        """
-        N = len(X_WO)
-        family = self.rng.integers(len(strata), size=(N, _GRASP_DRAWS))
-        choices: list[list[np.ndarray]] = [[np.zeros(0)] * _GRASP_DRAWS for _ in range(N)]
-        X_OG = np.empty((N, _GRASP_DRAWS, 4, 4))
-        for f, stratum in enumerate(strata):
-            i, j = np.nonzero(family == f)
-            c = stratum.draw_choices(self.rng, len(i))
-            X_OG[i, j] = stratum.family.pose(c)
-            for a, b, x in zip(i, j, c, strict=True):
-                choices[a][b] = x
-        X_OG1 = inverse(given.X_PO)
-        palm = X_OG[..., :3, 3] - _PALM * X_OG[..., :3, 2]
-        other = X_OG1[:3, 3] - _PALM * X_OG1[:3, 2]
-        apart = np.minimum(np.linalg.norm(palm - other, axis=2), _ROOM) / _PALM
-        outward = X_WO[:, :3, 3] - self.reach[receiver][0]
-        outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-        z = np.einsum("nij,nkj->nki", X_WO[:, :3, :3], X_OG[..., :3, 2])
-        score = 2 * apart + np.einsum("nki,ni->nk", z, outward)
-        pick = np.where(self.rng.random(N) < 0.75, np.argmax(score, axis=1), 0)
-        rows = np.arange(N)
-        return family[rows, pick], [choices[i][j] for i, j in zip(rows, pick, strict=True)], X_OG[rows, pick]
+    def _draw_grasp(self, robot: str, item: str, f: int) -> Attachment:
+        family = self.families[robot, item][f]
+        return self._grasp(robot, item, family, f, self.rng.uniform(family.lower, family.upper))
 
     def _contact(
         self,
@@ -575,18 +610,21 @@ class TransitionSampler:
         pair, swapped = self.collision.pair(giver, receiver)
         # The receiver's fingers close before the giver's open; both are looked at on their way.
         stages: list[tuple[Attachment | None, Attachment | None, tuple[float | None, float | None]]] = [
-            *((given, None, (None, w)) for w in self._widths(receiver, taken)),
-            *((None, taken, (w, None)) for w in self._widths(giver, given)),
+            (given, None, (None, None)),
+            *((None, None, (given.width, w)) for w in self._widths(receiver, taken)),
+            *((None, None, (w, taken.width)) for w in self._widths(giver, given)),
+            (None, taken, (None, None)),
         ]
-        a, b = qa[None], qb[None]
-        for ha, hb, widths in stages:
-            if swapped:
-                hit = pair.first_hit(b, hb, a, ha, widths[::-1])
-            else:
-                hit = pair.first_hit(a, ha, b, hb, widths)
-            if hit >= 0:
-                stats.collisions["each other"] += 1
-                return None
+
+        def apart(
+            a: np.ndarray, ha: Attachment | None, b: np.ndarray, hb: Attachment | None, w: tuple = (None, None)
+        ) -> bool:
+            hit = pair.first_hit(b, hb, a, ha, w[::-1]) if swapped else pair.first_hit(a, ha, b, hb, w)
+            return hit < 0
+
+        if not all(apart(qa[None], ha, qb[None], hb, widths) for ha, hb, widths in stages):
+            stats.collisions["each other"] += 1
+            return None
         chains = []
         for robot, q, world in ((giver, qa, worlds[0]), (receiver, qb, worlds[1])):
             X_WG = world.tool.matrix(q[None])[0]
@@ -595,6 +633,13 @@ class TransitionSampler:
                 stats.collisions["no approach"] += 1
                 return None
             chains.append((robot, q, chain))
+        # The receiver comes in while the giver holds, the giver leaves while the receiver holds.
+        leave = np.linspace(qa, chains[0][2][0], _EXCHANGE_SAMPLES)
+        enter = np.linspace(qb, chains[1][2][0], _EXCHANGE_SAMPLES)
+        stay_a, stay_b = np.tile(qa, (_EXCHANGE_SAMPLES, 1)), np.tile(qb, (_EXCHANGE_SAMPLES, 1))
+        if not (apart(stay_a, given, enter, None) and apart(leave, None, stay_b, taken)):
+            stats.collisions["no approach"] += 1
+            return None
         at: dict[str, int] = {}
         for robot, q, chain in chains:
             roadmap = self.roadmaps[robot]
@@ -644,10 +689,23 @@ def _random_rotations(rng: np.random.Generator, n: int, scale: float | None = No
     )
 
 
+def _palms(X_OG: np.ndarray) -> np.ndarray:
+    """Where the bulk of the hand is (..., 3) for grasps (..., 4, 4)."""
+    return X_OG[..., :3, 3] - _PALM * X_OG[..., :3, 2]
+
+
+def _rotations_to(directions: np.ndarray) -> np.ndarray:
+    """Rotations (n, 3, 3) whose third columns are along `directions` (n, 3)."""
+    norm = np.linalg.norm(directions, axis=1, keepdims=True)
+    z = np.where(norm > 1e-9, directions / np.maximum(norm, 1e-9), _UP)
+    helper = np.where(np.abs(z[:, 2:]) < 0.9, _UP, [1.0, 0.0, 0.0])
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=2)
+
+
 def _rotations_about(z: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Rotations (n, 3, 3) whose third column is `z`, turned about it by `angles`."""
-    x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [1.0, 0.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    y = np.cross(z, x)
+    """Rotations (n, 3, 3) whose third column is the unit vector `z`, turned about it by `angles`."""
+    R = _rotations_to(z[None])[0]
     c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    return np.stack([c * x + s * y, c * y - s * x, np.tile(z, (len(angles), 1))], axis=2)
+    return np.stack([c * R[:, 0] + s * R[:, 1], c * R[:, 1] - s * R[:, 0], np.tile(z, (len(angles), 1))], axis=2)
