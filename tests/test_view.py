@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -110,6 +112,36 @@ def test_names_cannot_break_the_page(plan: Plan, tmp_path: Path) -> None:
     text = write_html(problem, tmp_path / "page.html").read_text(encoding="utf-8")
     assert "</script><b>" not in text
     assert "<title>&lt;/script&gt;&lt;b&gt;&amp;name</title>" in text
+
+
+def test_pages_do_not_inherit_from_each_other(plan: Plan, file: Path, tmp_path: Path) -> None:
+    before = write_html(plan.problem, tmp_path / "a.html").read_text(encoding="utf-8")
+    write_html(plan, tmp_path / "b.html")
+    after = write_html(plan.problem, tmp_path / "c.html").read_text(encoding="utf-8")
+    assert len(before) == len(after) < file.stat().st_size
+
+
+def test_pages_and_windows_survive_threads() -> None:
+    """A Meshcat that is destroyed by a foreign thread ends the process, so this needs a process of its own."""
+    code = """if True:
+        import gc, threading
+        import mrtamp
+        from mrtamp.view import inline, view
+        problem = mrtamp.load_problem("box")
+        def work():
+            inline(problem)
+            view(problem)
+        threads = [threading.Thread(target=target) for target in (work, gc.collect, work, gc.collect)]
+        work()
+        for thread in threads:
+            thread.start()
+            thread.join()
+        gc.collect()
+        print("alive", flush=True)
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout == "alive\n"
+    assert done.returncode == 0, done.stderr
 
 
 def test_unwritable_page_is_an_error(plan: Plan, tmp_path: Path) -> None:

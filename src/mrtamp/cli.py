@@ -229,6 +229,21 @@ def _serve(what: Plan | Problem, options: argparse.Namespace) -> None:
             pass
 
 
+def _bench(options: argparse.Namespace) -> int:
+    from mrtamp import bench
+
+    rows = [row for row in bench.FIRST if options.only in row.name]
+    if not rows:
+        names = ", ".join(row.name for row in bench.FIRST)
+        raise _BadInput(f"--only: found {options.only!r}, expected part of one of: {names}")
+    with _stop_on_signals():
+        try:
+            good = bench.first_plans(options.seeds, rows, lambda text: print(text, flush=True))
+        except KeyboardInterrupt:
+            return NOT_FOUND
+    return FOUND if good else NOT_FOUND
+
+
 # -- input and output -----------------------------------------------------------------------------------------------
 
 
@@ -371,6 +386,12 @@ def _parser() -> argparse.ArgumentParser:
     problem_arguments(show)
     show.add_argument("--html", type=Path, metavar="FILE", help="write a page instead of opening a window")
     show.set_defaults(run=_show)
+
+    bench = commands.add_parser("bench", help="measure: time to the first checked plan, as a table")
+    bench.add_argument("suite", choices=["first"], help="first: the paper's tasks, time to the first checked plan")
+    bench.add_argument("--seeds", type=count, default=5, metavar="N", help="planner seeds per row (default 5)")
+    bench.add_argument("--only", metavar="TEXT", default="", help="only the rows whose name contains TEXT")
+    bench.set_defaults(run=_bench)
     return parser
 
 

@@ -15,12 +15,14 @@ import numpy as np
 
 from mrtamp.check import Checker, Report
 from mrtamp.check_report import Violation
-from mrtamp.collision import Collision, Counts
+from mrtamp.collision import RESOLUTION, Collision, Counts
+from mrtamp.explain import explain
 from mrtamp.graphs import Graphs
 from mrtamp.guidance import Choice, ModalGuidance
 from mrtamp.modes import Mode, objects_done, start_mode
-from mrtamp.plan import Plan, Transition, plan_cost
+from mrtamp.plan import Plan, Segment, Transition, plan_cost
 from mrtamp.problem import MrtampError, Problem, RobotAt
+from mrtamp.refine import Refiner
 from mrtamp.roadmap import Roadmap
 from mrtamp.steering import Steering
 from mrtamp.tensor_tree import At, Node, TensorTree
@@ -33,6 +35,16 @@ _PATIENCE = 4
 """Failures of a transition in a mode after which guidance no longer insists on promising candidates."""
 
 
+_PORTFOLIO = 3
+"""Plans under refinement at once."""
+_CHANCE = 600
+"""Proposals after which plans under refinement are compared."""
+_WORTH_CHECKING = 0.005
+"""Relative gain of a refined plan that is worth a check."""
+_TIE = 0.25
+"""Difference of optimistic estimates within which guidance chooses at random."""
+
+
 @dataclass(frozen=True)
 class Options:
     """Settings of the planner.
@@ -41,6 +53,7 @@ class Options:
     interior_samples : N_m, roadmap samples per iteration.  transition_samples : N_t, IK seeds per stratum and iteration.
     extensions : candidates the tree is extended to per iteration.
     persistent : share of iterations that ignore guidance, for ever.
+    refinements : proposals of refinement per iteration, once there is a plan; 0 leaves the tree's plans as they are.
     """
 
     initial_vertices: int = 40
@@ -48,6 +61,15 @@ class Options:
     transition_samples: int = 48
     extensions: int = 3
     persistent: float = 0.1
+    refinements: int = 60
+
+
+@dataclass
+class _Candidate:
+    """A plan under refinement, and its last version that passed the check."""
+
+    refiner: Refiner
+    checked: Plan
 
 
 @dataclass(frozen=True)
@@ -105,6 +127,7 @@ class Planner:
         self._tree_cost = np.inf
         self._checker: Checker | None = None
         self._banned: set[tuple] = set()
+        self._refiners: list[_Candidate] = []
         self._start()
         self._spent = time.perf_counter() - self._clock
 
@@ -139,6 +162,8 @@ class Planner:
                 self._extend_tree(orbit, choices, candidates)
                 self.iteration += 1
                 found = self._best_solution()
+                if self.best is not None and not (found and first):
+                    found = self._refine() or found
                 self._spent = time.perf_counter() - self._clock
                 if progress is not None:
                     progress(self.status())
@@ -220,14 +245,29 @@ class Planner:
         return path[int(self.rng.integers(len(path)))] if path else self._modal_frontier()
 
     def _optimistic_choices(self, mode: Mode) -> list[Choice]:
-        """The most promising transition, and sometimes others for further robots at the same time."""
+        """A transition of those that are optimistically best."""
         proposals = self.guidance.proposals(mode)
         if not proposals:
             return []
         least = proposals[0][0]
-        ties = [c for score, c in proposals if score <= least + 0.25]
-        out = [ties[int(self.rng.integers(len(ties)))]]
-        return out
+        ties = [c for score, c in proposals if score <= least + _TIE]
+        # Whoever acted longest ago acts next: alternating robots can move at the same time later on.
+        last = self._last_actions(mode)
+        oldest = min(max(last.get(r, -1) for r in c.robots) for c in ties)
+        ties = [c for c in ties if max(last.get(r, -1) for r in c.robots) == oldest]
+        return [ties[int(self.rng.integers(len(ties)))]]
+
+    def _last_actions(self, mode: Mode) -> dict[str, int]:
+        """When each robot last acted on the way to `mode`, counted in transitions."""
+        node = self.tree.entry(mode)
+        if node is None:
+            return {}
+        actions = [x.transition for x in self.tree.branch(node) if x.transition is not None]
+        return {r: i for i, t in enumerate(actions) for r in t.active}
+
+    def _still_best(self, mode: Mode, choice: Choice) -> bool:
+        proposals = self.guidance.proposals(mode)
+        return any(c == choice and score <= proposals[0][0] + _TIE for score, c in proposals)
 
     # -- sampling -------------------------------------------------------------------------------------------------
 
@@ -260,6 +300,9 @@ class Planner:
             # Grow the set while it is small, later in step with its logarithm, for ever.
             if len(known) < 4 or self.best is not None or self.rng.random() < 0.3 + self.options.persistent:
                 known = [*(c for c in self._sample(mode, choice) if c.promising or not guided), *known]
+            if guided and not self._still_best(mode, choice):
+                # What the sampler saw ahead changed the estimate: better to act on that.
+                return []
             if not known:
                 self.guidance.failures[mode.attachments, choice] += 1
                 return []
@@ -290,7 +333,7 @@ class Planner:
             return self.sampler.sample_pick(mode, choice.robots[0], choice.object, n)
         if choice.kind == "place":
             return self.sampler.sample_place(mode, choice.robots[0], choice.place, n)
-        return self.sampler.sample_handover(mode, *choice.robots, 2 * n)
+        return self.sampler.sample_handover(mode, *choice.robots, 3 * n // 2)
 
     def _discover_adjacent_orbit(self, orbit: int, combination: tuple[Candidate, ...]) -> None:
         """Note the modal state that a sampled transition leads to."""
@@ -399,27 +442,69 @@ class Planner:
             if node is None or node.cost >= self._tree_cost - 1e-9:
                 return False
             segments, transitions, groups = self.tree.trace(node)
-            plan = Plan(
-                self.problem,
-                segments,
-                transitions,
-                plan_cost(segments, transitions, self.problem.cost),
-                seed=self.seed,
-                versions=versions(),
-            )
-            plan.history = [{"time_s": 0.0, "cost": plan.cost}]
+            plan = self._plan(segments, transitions)
             report = self._judge(plan)
             if report.ok:
                 self._tree_cost = node.cost
                 self._path = [g[0].orbit for g in groups]
-                if self.best is not None and plan.cost >= self.best.cost:
-                    return False
-                self._history.append({"time_s": time.perf_counter() - self._clock, "cost": plan.cost})
-                plan.history = list(self._history)
-                plan.counts = self.counts.as_dict()
-                self.best = plan
-                return True
+                self._add_refiner(plan)
+                return self._offer(plan)
             self._repair(report, groups)
+
+    def _plan(self, segments: list[Segment], transitions: list[Transition]) -> Plan:
+        cost = plan_cost(segments, transitions, self.problem.cost)
+        plan = Plan(self.problem, segments, transitions, cost, seed=self.seed, versions=versions())
+        plan.history = [{"time_s": 0.0, "cost": cost}]
+        return plan
+
+    def _offer(self, plan: Plan) -> bool:
+        """Keep a checked plan if it beats the incumbent."""
+        if self.best is not None and plan.cost >= self.best.cost:
+            return False
+        self._history.append({"time_s": time.perf_counter() - self._clock, "cost": plan.cost})
+        plan.history = list(self._history)
+        plan.counts = self.counts.as_dict()
+        self.best = plan
+        return True
+
+    # -- refinement -----------------------------------------------------------------------------------------------
+
+    def _add_refiner(self, plan: Plan, resolution: float = RESOLUTION) -> None:
+        """Put a plan under refinement; of several, the dearest that had its chance makes room."""
+        if not self.options.refinements:
+            return
+        refiner = Refiner(
+            plan.segments,
+            plan.transitions,
+            self.problem.cost,
+            self.collision,
+            self.validity,
+            self.roadmaps,
+            self.rng,
+            resolution,
+        )
+        self._refiners.append(_Candidate(refiner, plan))
+        if len(self._refiners) > _PORTFOLIO:
+            self._refiners.remove(max(self._refiners, key=lambda c: c.refiner.cost))
+
+    def _refine(self) -> bool:
+        """A share of proposals to one of the plans under refinement; a clear gain is checked and offered."""
+        if not self._refiners:
+            return False
+        # The newest first gets as many proposals as the others have had, then the best is favoured.
+        candidate = min(self._refiners, key=lambda c: (c.refiner.proposals // _CHANCE, c.refiner.cost))
+        candidate.refiner.improve(self.options.refinements)
+        assert self.best is not None
+        if candidate.refiner.cost > self.best.cost * (1 - _WORTH_CHECKING):
+            return False
+        plan = self._plan(candidate.refiner.segments(), candidate.refiner.transitions)
+        if self._judge(plan).ok:
+            candidate.checked = plan
+            return self._offer(plan)
+        # Something slipped between the samples: go back to what was checked and look more closely.
+        self._refiners.remove(candidate)
+        self._add_refiner(candidate.checked, candidate.refiner.resolution / 2)
+        return False
 
     def _judge(self, plan: Plan) -> Report:
         if self._checker is None:
@@ -459,7 +544,7 @@ class Planner:
 
     def status(self) -> Status:
         """A snapshot for progress displays."""
-        remaining = min((self.guidance.remaining(m) for m in self._modes()), default=0.0) if self.best is None else 0.0
+        remaining = min((self.guidance.remaining(m) for m in self.modes()), default=0.0) if self.best is None else 0.0
         return Status(
             phase="first plan" if self.best is None else "improving",
             iteration=self.iteration,
@@ -471,14 +556,15 @@ class Planner:
             cost=self.best.cost if self.best else None,
         )
 
-    def _modes(self) -> Iterator[Mode]:
+    def modes(self) -> Iterator[Mode]:
+        """One discovered mode per modal state."""
         for orbits in self.graphs.orbits_of.values():
             if orbits:
                 yield self.graphs.mode(orbits[0])
 
     def explain(self) -> str:
         """Why there is no plan yet: per stratum what was tried and what stopped it, and who blocked whose motion."""
-        return ""
+        return explain(self)
 
 
 def versions() -> dict[str, str]:

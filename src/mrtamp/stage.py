@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import ctypes
+
 import numpy as np
 from pydrake.geometry import (
     Box,
@@ -54,12 +56,15 @@ class Stage:
     Parameters
     ----------
     problem : what to draw.
-    meshcat : the window; whatever mrtamp drew there before is replaced.
+    meshcat : the window; whatever mrtamp drew there before is replaced.  It lives as long as the process.
     """
 
     def __init__(self, problem: Problem, meshcat: Meshcat) -> None:
         self.problem = problem
         self.meshcat = meshcat
+        # Drake ends the process when a Meshcat is destroyed by another thread than its own, and the garbage collector,
+        # which breaks the reference cycles of a diagram, may run in any thread.  So a window is never destroyed.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(meshcat))
         meshcat.Delete(ROOT)
         builder = DiagramBuilder()
         self.scene = build_scene(problem, visuals=True, builder=builder)

@@ -43,6 +43,7 @@ class TensorTree:
         self.weights = weights
         self.nodes: list[Node] = []
         self._find: dict[tuple[tuple, At], Node] = {}
+        self._entries: dict[tuple, list[Node]] = {}
         self.of_orbit: dict[int, list[Node]] = {}
 
     def step_cost(self, a: At, b: At) -> float:
@@ -57,6 +58,10 @@ class TensorTree:
     def find(self, mode: Mode, at: At) -> Node | None:
         """The node at these vertices in this mode."""
         return self._find.get((mode.attachments, at))
+
+    def entry(self, mode: Mode) -> Node | None:
+        """The first node by which `mode` was entered that still stands."""
+        return next((x for x in self._entries.get(mode.attachments, []) if x.alive), None)
 
     def add_root(self, mode: Mode, at: At, orbit: int) -> Node:
         """The start."""
@@ -92,6 +97,8 @@ class TensorTree:
         self.nodes.append(node)
         self._find[mode.attachments, at] = node
         self.of_orbit.setdefault(orbit, []).append(node)
+        if parent is None or transition is not None:
+            self._entries.setdefault(mode.attachments, []).append(node)
         if parent is not None:
             parent.children.append(node)
         return node

@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import re
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -207,7 +208,8 @@ def view(what: Plan | Problem, meshcat: Meshcat | None = None) -> Viewer:
     Returns
     -------
     Viewer
-        Its `url` is where to point a browser; `run()` serves the play button and the slider.
+        Its `url` is where to point a browser; `run()` serves the play button and the slider.  The window stays until
+        the process ends.
     """
     plan = standstill(what) if isinstance(what, Problem) else what
     viewer = Viewer(plan, meshcat or _local_meshcat())
@@ -257,14 +259,24 @@ def inline(what: Plan | Problem, height: int = 560) -> InlinePage:
 def _page(what: Plan | Problem) -> str:
     plan = standstill(what) if isinstance(what, Problem) else what
     with _quiet():
-        meshcat = _local_meshcat()
+        meshcat = _recorder()
         stage = Stage(plan.problem, meshcat)
         playback = Playback(plan)
         _draw_traces(stage, playback)
-        if playback.duration > 0:
-            meshcat.SetAnimation(_animation(stage, playback))
+        meshcat.SetAnimation(_animation(stage, playback))
         page = meshcat.StaticHtml()
     return _with_player(page, plan, playback)
+
+
+_recorders: dict[int, Meshcat] = {}
+
+
+def _recorder() -> Meshcat:
+    """The hidden window in which this thread makes its pages: windows cannot change threads, and ports are few."""
+    thread = threading.get_ident()
+    if thread not in _recorders:
+        _recorders[thread] = _local_meshcat()
+    return _recorders[thread]
 
 
 def _local_meshcat() -> Meshcat:
@@ -299,6 +311,8 @@ def _animation(stage: Stage, playback: Playback) -> MeshcatAnimation:
     times = np.arange(int(np.ceil(playback.duration * FRAME_RATE)) + 1) / FRAME_RATE
     animation = MeshcatAnimation(FRAME_RATE)
     animation.set_autoplay(True)
+    if playback.duration == 0:
+        return animation
     for path, X in stage.body_poses(playback.positions(stage.scene, times)).items():
         p, orientation = X[:, :3, 3], quaternions(X[:, :3, :3])
         for k in keyframes(p, orientation, _POSITION_TOLERANCE, _ANGLE_TOLERANCE):

@@ -38,8 +38,14 @@ class Family(Protocol):
 
 def residual(family: Family, Y: np.ndarray) -> np.ndarray:
     """The constraint h (N, 6 - k): zero exactly on the members of the family (bounds aside)."""
-    D = inverse(family.pose(family.coordinates(Y))) @ Y
-    return np.concatenate([rotation_vectors(D[:, :3, :3]), D[:, :3, 3]], axis=1)[:, family.rows]
+    X = family.pose(family.coordinates(Y))
+    D = inverse(X) @ Y
+    parts = [rotation_vectors(D[:, :3, :3]), D[:, :3, 3]]
+    if isinstance(family, RegionPlacement):
+        # A placement's freedom lies along the axes of the support, however the object is turned on it.
+        R_SO = family.X_BS[:3, :3].T @ X[:, :3, :3]
+        parts = [np.einsum("nij,nj->ni", R_SO, v) for v in parts]
+    return np.concatenate(parts, axis=1)[:, family.rows]
 
 
 def _rotation_z(angle: np.ndarray) -> np.ndarray:
@@ -131,26 +137,31 @@ class TurningGrasp:
     range: tuple[float, float]
 
     @property
+    def _slides(self) -> bool:
+        return self.range[1] > self.range[0]
+
+    @property
     def lower(self) -> np.ndarray:
-        """Angle, slide."""
-        return np.array([-np.pi, self.range[0]])
+        """Angle, and slide where that is free."""
+        return np.array([-np.pi, self.range[0]])[: 1 + self._slides]
 
     @property
     def upper(self) -> np.ndarray:
-        """Angle, slide."""
-        return np.array([np.pi, self.range[1]])
+        """Angle, and slide where that is free."""
+        return np.array([np.pi, self.range[1]])[: 1 + self._slides]
 
     @property
     def rows(self) -> tuple[int, ...]:
-        """All but the turn (rotation about the G axis that is parallel to the object's z) and the slide."""
+        """All but the turn (rotation about the G axis that is parallel to the object's z) and a free slide."""
         turn = 2 if self.slide == 2 else 0
-        return tuple(i for i in range(6) if i not in (turn, 3 + self.slide))
+        return tuple(i for i in range(6) if i != turn and not (self._slides and i == 3 + self.slide))
 
     def pose(self, c: np.ndarray) -> np.ndarray:
         """X_OG (N, 4, 4)."""
         Z = matrix(_rotation_z(c[:, 0]), np.zeros((len(c), 3)))
         X = np.tile(self.X, (len(c), 1, 1))
-        X[:, :3, 3] += c[:, 1:] * self.X[:3, self.slide]
+        slide = c[:, 1:] if self._slides else np.full((len(c), 1), self.range[0])
+        X[:, :3, 3] += slide * self.X[:3, self.slide]
         return Z @ X
 
     def coordinates(self, Y: np.ndarray) -> np.ndarray:
@@ -159,7 +170,7 @@ class TurningGrasp:
         angle = np.arctan2(y0[0] * y[:, 1] - y0[1] * y[:, 0], y0[0] * y[:, 0] + y0[1] * y[:, 1])
         Z = matrix(_rotation_z(-angle), np.zeros((len(Y), 3)))
         p = (inverse(self.X) @ Z @ Y)[:, :3, 3]
-        return np.column_stack([angle, p[:, self.slide]])
+        return np.column_stack([angle, p[:, self.slide]])[:, : 1 + self._slides]
 
 
 GraspFamily = FixedFamily | SlidingGrasp | TurningGrasp
@@ -252,7 +263,7 @@ class RegionPlacement:
 
     @property
     def rows(self) -> tuple[int, ...]:
-        """Tilt and height, and what is not free.  The residual is taken after undoing R_face (see `pose`)."""
+        """Tilt and height, and what is not free, along the axes of S."""
         fixed = {0: 3, 1: 4, 2: 2}
         return (0, 1, 5, *(fixed[i] for i in range(3) if i not in self._free))
 
@@ -269,6 +280,8 @@ class RegionPlacement:
         X = inverse(self.X_BS) @ Y
         R = X[:, :3, :3] @ self.R_face.T
         yaw = np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1])
+        middle = sum(self.yaw) / 2
+        yaw = middle + (yaw - middle + np.pi) % (2 * np.pi) - np.pi
         return np.column_stack([X[:, :2, 3], yaw])[:, self._free]
 
 

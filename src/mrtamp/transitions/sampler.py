@@ -253,7 +253,7 @@ class TransitionSampler:
                     break
         return out
 
-    def sample_handover(self, mode: Mode, giver: str, receiver: str, n: int = 96, keep: int = 3) -> list[Candidate]:
+    def sample_handover(self, mode: Mode, giver: str, receiver: str, n: int = 72, keep: int = 3) -> list[Candidate]:
         """Sample handovers of what `giver` holds to `receiver`; returns the new candidates."""
         grasp = mode.held[giver]
         item = grasp.object
@@ -401,7 +401,7 @@ class TransitionSampler:
         if not len(grasps):
             return reward
         world = self.roadmaps[robot].world
-        places: list[tuple[str, dict[str, np.ndarray], np.ndarray]] = []
+        places: list[tuple[Support, dict[str, np.ndarray], np.ndarray]] = []
         for support in self.goal_supports[item]:
             body = support.body
             if body in mode.of and mode.of[body].held:
@@ -410,8 +410,13 @@ class TransitionSampler:
             below = {a.object: self.validity.world_pose(chain[k:]) for k, a in enumerate(chain)}
             for f in placement_families(self.problem.object(item), support, self.problem.package_paths):
                 c = self.rng.uniform(f.lower, f.upper, size=(len(grasps), len(f.lower)))
-                places.append((body, below, self._body_pose(mode, body) @ f.pose(c)))
-        if not places or not self.in_reach(robot, places[0][2][0, :3, 3]):
+                places.append((support, below, self._body_pose(mode, body) @ f.pose(c)))
+        if not places:
+            return reward
+        # What is found out here about the places is what sampling them would have found out.
+        for name in dict.fromkeys(support.name for support, _, _ in places):
+            self.outcome(("place", (robot,), item, name)).calls += 1
+        if not any(self.in_reach(robot, X[0, :3, 3]) for _, _, X in places):
             return reward
         which = self.rng.integers(len(places), size=len(grasps))
         X_WO = np.array([places[k][2][i] for i, k in enumerate(which)])
@@ -419,10 +424,13 @@ class TransitionSampler:
         seeds = np.where(self.rng.random(len(q))[:, None] < 0.5, q, world.home)
         found, solved = self._ik(robot, X_WG, seeds + self.rng.normal(scale=0.3, size=q.shape))
         for i in np.flatnonzero(solved):
-            body, below, _ = places[which[i]]
+            support, below, _ = places[which[i]]
+            stats = self.outcome(("place", (robot,), item, support.name))
+            stats.ik_solved += 1
             rows = world.rows(found[i][None], grasps[i], below)
-            if world.first_hit(rows, body, world.slot_of[item]) < 0:
+            if world.first_hit(rows, support.body, world.slot_of[item]) < 0:
                 reward[i] = np.linalg.norm(found[i] - q[i])
+                stats.accepted += 1
         return reward
 
     def _meetings(

@@ -1,0 +1,111 @@
+"""Measuring: time to the first checked plan on the paper's tasks, as one table (`mrtamp bench first`).
+
+Every row runs in a process of its own, so that nothing is warm and its peak memory is its own.
+"""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+
+FIRST_BUDGET_S = 60.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """One problem of the table: what to load, the median aimed for (s), and what the paper needed (24 cores)."""
+
+    problem: str
+    parameters: dict[str, int]
+    aim_s: float
+    paper: str
+
+    @property
+    def name(self) -> str:
+        """The problem, with robots/objects where it is generated."""
+        if not self.parameters:
+            return self.problem
+        return f"{self.problem} {self.parameters['robots']}/{self.parameters['objects']}"
+
+
+def _pick_place(robots: int, objects: int, aim_s: float, paper: str) -> Row:
+    return Row("pick_place", {"robots": robots, "objects": objects}, aim_s, paper)
+
+
+FIRST = (
+    Row("box", {}, 1.0, "10 s"),
+    Row("handover", {}, 1.0, "12 s"),
+    Row("stacking", {}, 2.0, "47 s"),
+    _pick_place(2, 2, 0.5, "4 s"),
+    _pick_place(2, 4, 1.0, "30 s"),
+    _pick_place(2, 6, 1.5, "53 s"),
+    _pick_place(3, 3, 1.0, "7 s"),
+    _pick_place(3, 6, 2.0, "111 s"),
+    _pick_place(4, 4, 2.0, "57 s"),
+    _pick_place(4, 6, 3.0, "176 s (80 %)"),
+    _pick_place(8, 24, 60.0, "-"),
+)
+
+
+@dataclass(frozen=True)
+class Result:
+    """Seconds from the loaded problem to the first checked plan and its cost, per seed (None: no plan), and peak memory."""
+
+    seconds: list[float | None]
+    costs: list[float | None]
+    peak_mb: float
+
+
+def measure(row: Row, seeds: Sequence[int], budget_s: float) -> Result:
+    """Run one row in this process."""
+    from mrtamp.planner import Planner
+    from mrtamp.problem_file import load_problem
+
+    seconds: list[float | None] = []
+    costs: list[float | None] = []
+    for seed in seeds:
+        problem = load_problem(row.problem, **row.parameters)
+        start = time.perf_counter()
+        planner = Planner(problem, seed=seed)
+        found = next(planner.improve(budget_s, first=True), None)
+        seconds.append(time.perf_counter() - start if found else None)
+        costs.append(found.cost if found else None)
+    # Kilobytes on Linux, bytes on macOS.
+    unit = 1024**2 if sys.platform == "darwin" else 1024
+    return Result(seconds, costs, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit)
+
+
+def start_to_exit() -> float:
+    """Seconds of `mrtamp plan pick_place --robots 2 --objects 2 --first`, start to exit."""
+    command = [sys.executable, "-m", "mrtamp", "plan", "pick_place", "--robots", "2", "--objects", "2", "--first"]
+    start = time.perf_counter()
+    subprocess.run([*command, "--quiet"], check=True)
+    return time.perf_counter() - start
+
+
+def first_plans(seeds: int, rows: Sequence[Row] = FIRST, say: Callable[[str], None] = print) -> bool:
+    """Print the table of first plans, row by row; returns whether every row succeeded within its aim."""
+    say(f"| problem | success | median first plan | slowest | aim | median cost | peak memory | the paper |\n|{'---|' * 8}")
+    good = True
+    for row in rows:
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            result = pool.submit(measure, row, range(seeds), FIRST_BUDGET_S).result()
+        times = [t for t in result.seconds if t is not None]
+        # A run without a plan counts as the whole budget.
+        median = statistics.median(t if t is not None else FIRST_BUDGET_S for t in result.seconds)
+        cost = statistics.median([c for c in result.costs if c is not None]) if times else float("nan")
+        good &= len(times) == seeds and median <= row.aim_s
+        say(
+            f"| {row.name} | {len(times)}/{seeds} | {median:.2f} s | {max(times, default=float('nan')):.2f} s "
+            f"| {row.aim_s:g} s | {cost:.1f} | {result.peak_mb:.0f} MB | {row.paper} |"
+        )
+    whole = statistics.median(start_to_exit() for _ in range(seeds))
+    say(f"\n`mrtamp plan pick_place --robots 2 --objects 2 --first`, start to exit: median {whole:.2f} s (aim 4 s)")
+    return good and whole < 4.0
