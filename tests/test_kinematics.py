@@ -211,7 +211,9 @@ def test_rotation_vectors_are_drakes_axis_and_angle() -> None:
 
 def test_inverse_is_the_inverse_for_stacks_of_transforms() -> None:
     rng = np.random.default_rng(3)
-    X = np.array([RigidTransform(RollPitchYaw(*rng.uniform(-3, 3, 3)), rng.normal(size=3)).GetAsMatrix4() for _ in "abcdef"])
+    X = np.array(
+        [RigidTransform(RollPitchYaw(*rng.uniform(-3, 3, 3)), rng.normal(size=3)).GetAsMatrix4() for _ in "abcdef"]
+    )
     np.testing.assert_allclose(inverse(X) @ X, np.broadcast_to(np.eye(4), X.shape), atol=1e-14)
     stacked = X.reshape(2, 3, 4, 4)
     np.testing.assert_array_equal(inverse(stacked), inverse(X).reshape(2, 3, 4, 4))

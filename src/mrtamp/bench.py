@@ -56,7 +56,7 @@ FIRST = (
 
 @dataclass(frozen=True)
 class Result:
-    """Seconds from the loaded problem to the first checked plan and its cost, per seed (None: no plan), and peak memory."""
+    """Seconds from the loaded problem to the first checked plan, its cost (None: no plan), per seed; peak memory."""
 
     seconds: list[float | None]
     costs: list[float | None]
@@ -92,7 +92,10 @@ def start_to_exit() -> float:
 
 def first_plans(seeds: int, rows: Sequence[Row] = FIRST, say: Callable[[str], None] = print) -> bool:
     """Print the table of first plans, row by row; returns whether every row succeeded within its aim."""
-    say(f"| problem | success | median first plan | slowest | aim | median cost | peak memory | the paper |\n|{'---|' * 8}")
+    say(
+        "| problem | success | median first plan | slowest | aim | median cost | peak memory | the paper |\n"
+        f"|{'---|' * 8}"
+    )
     good = True
     for row in rows:
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:

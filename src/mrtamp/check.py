@@ -281,11 +281,14 @@ class Checker:
 
     def _fingers(self, one: Motion, two: Motion, judge: MotionJudge, report: Report) -> None:
         """Fingers that close or open at a transition meet nothing but what they grasp or let go."""
-        z = np.vstack([one.z[-1], one.z[-1]])
+        start, end = one.z[-1], one.z[-1].copy()
         for columns in self.world.fingers.values():
-            z[1, columns] = two.z[0, columns]
-        if np.array_equal(z[0], z[1]):
-            return
+            end[columns] = two.z[0, columns]
+        # In a handover the receiver closes before the giver opens.
+        closed = np.where(np.abs(end) < np.abs(start), end, start)
         poses = {name: X[0] for name, X in Timeline(self.world, one).state_at_end().items()}
-        sweep = Motion(z, one.segment, {}, {**one.resting, **poses}, one.allowed | two.allowed, max(len(one.z) - 2, 0))
-        judge.judge(Timeline(self.world, sweep), report, {})
+        allowed, step = one.allowed | two.allowed, max(len(one.z) - 2, 0)
+        for z in (np.vstack([start, closed]), np.vstack([closed, end])):
+            if not np.array_equal(z[0], z[1]):
+                sweep = Motion(z, one.segment, {}, {**one.resting, **poses}, allowed, step)
+                judge.judge(Timeline(self.world, sweep), report, {})

@@ -181,7 +181,10 @@ def _check(options: argparse.Namespace) -> int:
 
     report = check_plan(_load_plan(options.plan))
     if options.json:
-        violations = [{"kind": v.kind, "message": v.message} for v in report.violations]
+        violations = [
+            {"kind": v.kind, "message": v.message, "segment": v.segment, "step": v.step, "value": v.value}
+            for v in report.violations
+        ]
         clearance = report.min_clearance_m if report.min_clearance_m != float("inf") else None
         facts = {"samples": report.samples, "min_clearance_m": clearance, "elapsed_s": report.elapsed}
         print(json.dumps({"ok": report.ok, "violations": violations, **facts}))

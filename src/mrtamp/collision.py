@@ -1,8 +1,9 @@
 """Collision queries, factored: one robot with what it holds against the world, and pairs of robots.
 
 Every query is answered by Drake's `QueryObject.HasCollisions` on a small plant of its own (DESIGN section 4).  What a
-robot holds is a *slot*: a free body of the object's shape that may touch the gripper's bodies, so that changing a mode never
-changes a collision filter.  Between two robots the arms' shapes are padded, because edges are checked at samples only.
+robot holds is a *slot*: a free body of the object's shape that may touch the gripper's bodies, so that changing a
+mode never changes a collision filter.  Between two robots the arms' shapes are padded, because edges are checked at
+samples only.
 """
 
 from __future__ import annotations
@@ -11,8 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, QueryObject
-from pydrake.geometry import Box, Capsule, Cylinder, Sphere
+from pydrake.geometry import Box, Capsule, CollisionFilterDeclaration, Cylinder, GeometrySet, QueryObject, Sphere
 
 from mrtamp.kinematics import Chain, Tool, quaternions
 from mrtamp.modes import Attachment

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mrtamp.transitions.sampler import Outcome, StratumKey
+from mrtamp.transitions.candidate import Outcome, StratumKey
 
 if TYPE_CHECKING:
     from mrtamp.planner import Planner
@@ -20,7 +20,9 @@ def explain(planner: Planner) -> str:
     if nearest is not None:
         waiting = [o.name for o in planner.problem.objects if not planner.guidance.done(nearest, o.name)]
         where = ", ".join(f"{name} ({nearest.of[name].place})" for name in waiting)
-        lines.append(f"Of {len(planner.graphs.modal)} modal states the nearest to the goal still lacks: {where or 'nothing'}")
+        lines.append(
+            f"Of {len(planner.graphs.modal)} modal states the nearest to the goal still lacks: {where or 'nothing'}"
+        )
         if not waiting:
             lines.append("All objects are where they belong; robots could not reach their final configurations.")
     wanted = {c.object for c in planner.problem.goal if hasattr(c, "object")}
@@ -64,5 +66,3 @@ def _why(outcome: Outcome) -> str:
     if named:
         parts.append("refused for " + ", ".join(named))
     return "; ".join(parts)
-
-

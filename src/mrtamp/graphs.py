@@ -1,7 +1,7 @@
 """The modal graph G_M and the orbital graph G_O as networkx graphs that a reader can print (paper, section V).
 
-An orbit is what connectivity has been *proved*: a component of a mode's explored tensor nodes.  Two entries into one mode
-are two orbits until a validated motion joins them.
+An orbit is what connectivity has been *proved*: a component of a mode's explored tensor nodes.  Two entries into one
+mode are two orbits until a validated motion joins them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Where planning effort goes: optimistic modal guidance, orbit-path guidance, persistent exploration (paper, section V).
+"""Where planning effort goes before there is a plan: optimistic modal guidance (paper, section V).
 
-Guidance works on names alone: for each object a small graph whose nodes are the places it can be (supports, robots) and whose edges are
-pick, place and handover, each at an optimistic cost of one, dearer the more often it was tried in vain.
+Guidance works on names alone: for each object a small graph whose nodes are the places it can be (supports, robots)
+and whose edges are pick, place and handover, each at an optimistic cost of one, dearer the more often it was tried in
+vain.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import numpy as np
 
 from mrtamp.modes import Mode, condition_holds
 from mrtamp.problem import AtPose, HeldBy, Problem, RobotAt
-from mrtamp.transitions.sampler import StratumKey, TransitionSampler
+from mrtamp.transitions.candidate import StratumKey
+from mrtamp.transitions.sampler import TransitionSampler
 
 FAILED_CALL = 3.0
 """What a sampling call without any accepted sample adds to the optimistic cost of its edge."""
@@ -169,7 +171,7 @@ class ModalGuidance:
         return out
 
     def proposals(self, mode: Mode) -> list[tuple[float, Choice]]:
-        """Enabled transitions with how dear each is by the optimistic estimate; zero is on a best path, lowest first."""
+        """Enabled transitions and how much dearer than the best path each is by the estimate, lowest first."""
         out = []
         blockers = self._blockers(mode)
         enabled = self.enabled(mode)

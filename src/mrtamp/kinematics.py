@@ -139,7 +139,7 @@ class Chain:
         kind = joint.type_name()
         if kind == "weld":
             X_FM = joint.X_FM()
-            before, after, kind, column = X_PF @ X_FM @ X_MC, RigidTransform(), "weld", -1
+            before, kind, column = X_PF @ X_FM @ X_MC, "weld", -1
             R, p = before.rotation().matrix(), before.translation()
             R_after, p_after = np.eye(3), np.zeros(3)
         elif kind in ("revolute", "prismatic"):
@@ -161,7 +161,7 @@ class Chain:
                     M = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
                     R, p = R @ M @ R_after, p + R @ M @ p_after
                 else:
-                    p = p + R @ (p_after + [0, 0, value])
+                    p = p + R @ (p_after + np.array([0, 0, value]))
                     R = R @ R_after
                 kind, column, R_after, p_after = "weld", -1, np.eye(3), np.zeros(3)
         else:

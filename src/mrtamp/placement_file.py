@@ -22,7 +22,7 @@ from mrtamp.problem import (
 from mrtamp.reading import Value, join
 from mrtamp.resting import FACES, bounding_box, face_down, face_normal, flat_face, opposite, resting_pose
 
-REST_TOLERANCE = 0.002
+REST_TOLERANCE = 0.001
 EDGE_TOLERANCE = 0.001
 TILT_TOLERANCE = np.radians(1.0)
 STEEPEST_SURFACE = np.radians(25.0)

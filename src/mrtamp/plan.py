@@ -33,7 +33,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Action:
-    """One elementary change: `kind` is pick, place or handover; `robots` (receiver last); the object's new attachment."""
+    """One elementary change: pick, place or handover, by `robots` (receiver last), of an object's attachment."""
 
     kind: str
     robots: tuple[str, ...]

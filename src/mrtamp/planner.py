@@ -26,10 +26,10 @@ from mrtamp.refine import Refiner
 from mrtamp.roadmap import Roadmap
 from mrtamp.steering import Steering
 from mrtamp.tensor_tree import At, Node, TensorTree
+from mrtamp.transitions.candidate import Candidate
 from mrtamp.transitions.projection import uniform_configurations
-from mrtamp.transitions.sampler import Candidate, TransitionSampler
+from mrtamp.transitions.sampler import TransitionSampler
 from mrtamp.validity import Validity
-
 
 _PATIENCE = 4
 """Failures of a transition in a mode after which guidance no longer insists on promising candidates."""
@@ -50,7 +50,8 @@ class Options:
     """Settings of the planner.
 
     initial_vertices : free configurations per robot on the roadmaps before the search starts.
-    interior_samples : N_m, roadmap samples per iteration.  transition_samples : N_t, IK seeds per stratum and iteration.
+    interior_samples : N_m, roadmap samples per iteration.  transition_samples : N_t, IK seeds per stratum and
+    iteration.
     extensions : candidates the tree is extended to per iteration.
     persistent : share of iterations that ignore guidance, for ever.
     refinements : proposals of refinement per iteration, once there is a plan; 0 leaves the tree's plans as they are.
@@ -194,12 +195,11 @@ class Planner:
             where = self.validity.stand(mode, dict(zip(self.names, at, strict=True)), (robot.name,))
             if where is not None:
                 roadmap = self.roadmaps[robot.name]
-                rows = roadmap.world.rows(
-                    roadmap.q[[v]], None, {r.name: r.X_WO for r in self.validity.resting(mode)}
-                )
+                rows = roadmap.world.rows(roadmap.q[[v]], None, {r.name: r.X_WO for r in self.validity.resting(mode)})
                 pairs = roadmap.world.culprits(rows[0]) or [(robot.name, where)]
                 raise MrtampError(
-                    f"problem {self.problem.name}: robot {robot.name} starts in collision ({pairs[0][0]} with {pairs[0][1]})"
+                    f"problem {self.problem.name}: robot {robot.name} starts in collision "
+                    f"({pairs[0][0]} with {pairs[0][1]})"
                 )
         for robot in self.problem.robots:
             self._add_interior(robot.name, self.options.initial_vertices)
@@ -333,7 +333,8 @@ class Planner:
             return self.sampler.sample_pick(mode, choice.robots[0], choice.object, n)
         if choice.kind == "place":
             return self.sampler.sample_place(mode, choice.robots[0], choice.place, n)
-        return self.sampler.sample_handover(mode, *choice.robots, 3 * n // 2)
+        giver, receiver = choice.robots
+        return self.sampler.sample_handover(mode, giver, receiver, 3 * n // 2)
 
     def _discover_adjacent_orbit(self, orbit: int, combination: tuple[Candidate, ...]) -> None:
         """Note the modal state that a sampled transition leads to."""
@@ -528,8 +529,8 @@ class Planner:
             if step + 1 < len(group):
                 before, after = group[step], group[step + 1]
                 guilty = self._guilty(violation, before)
-                maps = [dict(zip(self.names, x.at, strict=True)) for x in (before, after)]
-                self.validity.forbid(before.mode, *maps, guilty)
+                one, two = (dict(zip(self.names, x.at, strict=True)) for x in (before, after))
+                self.validity.forbid(before.mode, one, two, guilty)
                 if after.alive:
                     self.tree.cut(after)
 

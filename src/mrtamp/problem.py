@@ -126,9 +126,9 @@ class AntipodalGrasps:
     """Grasps on opposite faces of a box (or around a cylinder), approached along the given object axes.
 
     The approach direction z_G is one of `approaches` (e.g. "-z": from above); the fingers close along an axis
-    perpendicular to it (a box: one of the other two axes, whose extent must fit the gripper; a cylinder approached along
-    its axis or its side: every angle in between).  The grasp point slides along the face by up to `offset` (m, each
-    way, along the remaining axis) and sinks `depth` (m) from the object's near face towards its far face: a range.
+    perpendicular to it (a box: one of the other two axes, whose extent must fit the gripper; a cylinder approached
+    along its axis or its side: every angle in between).  The grasp point slides along the face by up to `offset` (m,
+    each way, along the remaining axis) and sinks `depth` (m) from the object's near face towards its far face: a range.
     """
 
     approaches: tuple[str, ...]

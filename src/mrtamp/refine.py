@@ -1,8 +1,9 @@
 """Refinement of an incumbent: robot-wise shortcuts and re-timing on the composite polyline (DESIGN section 8).
 
-A plan becomes a sequence of knots, one configuration per robot at each, with the knot at which every transition happens.  A proposal
-changes one robot between two of its own anchors while the others stay as they are; it is priced first and checked only when
-it pays.  Because a robot's motion may be spread over knots at which others move, arms come to move at the same time.
+A plan becomes a sequence of knots, one configuration per robot at each, with the knot at which every transition
+happens.  A proposal changes one robot between two of its own anchors while the others stay as they are; it is priced
+first and checked only when it pays.  Because a robot's motion may be spread over knots at which others move, arms
+come to move at the same time.
 """
 
 from __future__ import annotations
@@ -242,9 +243,7 @@ class Refiner:
                 return False
         return True
 
-    def _segment_is_free(
-        self, robot: str, mode: Mode, i: int, fresh: np.ndarray, k: np.ndarray, t: np.ndarray
-    ) -> bool:
+    def _segment_is_free(self, robot: str, mode: Mode, i: int, fresh: np.ndarray, k: np.ndarray, t: np.ndarray) -> bool:
         world = self.roadmaps[robot].world
         q = fresh[k] + t[:, None] * (fresh[k + 1] - fresh[k])
         held = mode.held.get(robot)
@@ -285,4 +284,3 @@ class Refiner:
             if hit >= 0:
                 return False
         return True
-

@@ -1,11 +1,13 @@
 """Constituent roadmaps G_r: one per robot, shared by all modes, growing for ever, validated lazily (paper, section V).
 
 A roadmap knows geometry (configurations, lengths, sampled edges) and search; whether an edge is free in a mode is the
-business of `mrtamp.validity`.  Transition configurations are vertices that are reached through their own approach chain.
+business of `mrtamp.validity`.  Transition configurations are vertices that are reached through their own approach
+chain.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -182,7 +184,7 @@ def lazy_path(
         path = roadmap.shortest(start, goal, blocked)
         if path is None:
             return None
-        edges = [roadmap.edge(a, b) for a, b in zip(path[:-1], path[1:], strict=True)]
+        edges = [roadmap.edge(a, b) for a, b in itertools.pairwise(path)]
         # The ends are the tightest parts: they fail first.
         order = sorted(range(len(edges)), key=lambda i: min(i, len(edges) - 1 - i))
         for i in order:

@@ -6,44 +6,22 @@ judge, and the full one with visuals for Meshcat.  Section III of the paper; DES
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 from pydrake.geometry import Box, Capsule, CollisionFilterDeclaration, Cylinder, GeometrySet, SceneGraph, Sphere
 from pydrake.geometry import Shape as DrakeShape
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import PackageMap, Parser
+from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from mrtamp.kinematics import Chain, Tool, quaternions
+from mrtamp.model_files import make_parser
 from mrtamp.problem import MovableObject, MrtampError, Problem, Robot, RobotModel, Shape, StaticBody
-
-PACKAGE_PATH_VARIABLE = "MRTAMP_PACKAGE_PATH"
-
-
-def package_map(paths: Iterable[Path]) -> PackageMap:
-    """Packages for `package://` URLs: directories that hold a package.xml, from `paths` and MRTAMP_PACKAGE_PATH.
-
-    Drake's own entry for `drake_models` would download; it is dropped unless a directory provides it.
-    """
-    packages = PackageMap()
-    if packages.Contains("drake_models"):
-        packages.Remove("drake_models")
-    extra = [Path(p) for p in os.environ.get(PACKAGE_PATH_VARIABLE, "").split(os.pathsep) if p]
-    for path in [*paths, *extra]:
-        file = path / "package.xml"
-        if not file.is_file():
-            raise MrtampError(f"package directory {path} has no package.xml")
-        name = ElementTree.parse(file).getroot().findtext("name", "").strip()
-        if not packages.Contains(name):
-            packages.AddPackageXml(str(file))
-    return packages
 
 
 def drake_shape(shape: Shape) -> DrakeShape:
@@ -179,12 +157,8 @@ def build_scene(
     own_builder = builder is None
     builder = builder or DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
-    parser = Parser(plant)
+    parser = make_parser(plant, scene_graph, problem.package_paths)
     parser.SetAutoRenaming(True)
-    parser.package_map().AddMap(PackageMap.MakeEmpty())
-    if parser.package_map().Contains("drake_models"):
-        parser.package_map().Remove("drake_models")
-    parser.package_map().AddMap(package_map(problem.package_paths))
 
     included = {name: problem.robot(name) for name in (robots or [r.name for r in problem.robots])}
     instances: dict[str, ModelInstanceIndex] = {}
@@ -271,8 +245,8 @@ def _pad(
 ) -> None:
     """Grow a robot's primitive collision shapes, so that motion between checked samples is covered too.
 
-    Changing a shape drops the filters Drake had set for it (same body, adjacent bodies): the caller excludes the robot's own
-    pairs again.
+    Changing a shape drops the filters Drake had set for it (same body, adjacent bodies): the caller excludes the
+    robot's own pairs again.
     """
     source = plant.get_source_id()
     inspector = scene_graph.model_inspector()
@@ -304,18 +278,3 @@ def chain_of(scene: Scene, name: str) -> tuple[Chain, Tool]:
     fixed = {j: f * gripper.max_width for j, f in gripper.joints.items()} if gripper else {}
     chain = Chain(scene.plant, in_scene.instance, model.base, in_scene.robot.X_WB, model.arm_joints, fixed)
     return chain, Tool(chain, model.grasp_body, model.X_BG)
-
-
-__all__ = [
-    "PACKAGE_PATH_VARIABLE",
-    "RobotInScene",
-    "Scene",
-    "build_scene",
-    "chain_of",
-    "drake_shape",
-    "geometry_ids",
-    "gripper_bodies",
-    "package_map",
-    "parse_robot",
-    "robot_bodies",
-]

@@ -1,11 +1,13 @@
 """GetNeighbor and LazyValidate: which tensor neighbour a node is extended to (paper, algorithm 1; dRRT* oracle).
 
-The informed oracle sends each active robot along its shortest roadmap path, validated lazily in the context of the mode and of
-where the others stand; robots in the way are sent aside first.  The uninformed one takes random tensor neighbours.
+The informed oracle sends each active robot along its shortest roadmap path, validated lazily in the context of the
+mode and of where the others stand; robots in the way are sent aside first.  The uninformed one takes random tensor
+neighbours.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 
@@ -39,7 +41,8 @@ class Steering:
     def drive(self, node: Node, targets: dict[str, int], depth: int = 1) -> Node | None:
         """Bring robots to target vertices, one after another, others standing; None if some cannot get there.
 
-        Robots in the way are first sent aside, up to `depth` levels deep.  Orders of the active robots are tried in turn.
+        Robots in the way are first sent aside, up to `depth` levels deep.  Orders of the active robots are tried in
+        turn.
         """
         pending = [r for r, v in targets.items() if node.at[self.index[r]] != v]
         if not pending:
@@ -80,7 +83,7 @@ class Steering:
         """Send `other` to a vertex from which it does not block `robot`'s path."""
         roadmap = self.roadmaps[self.index[other]]
         own = self.roadmaps[self.index[robot]]
-        edges = [own.edge(a, b) for a, b in zip(path[:-1], path[1:], strict=True)]
+        edges = [own.edge(a, b) for a, b in itertools.pairwise(path)]
         open_vertices = roadmap.open_vertices()
         random = [open_vertices[i] for i in self.rng.integers(len(open_vertices), size=_ASIDE)]
         here = node.at[self.index[other]]
@@ -156,8 +159,6 @@ class Steering:
                 if j in moving:
                     if not self.validity.move(mode, names[i], (a[i], b[i]), names[j], (a[j], b[j])):
                         return False
-                elif not self.validity.against(
-                    names[i], self.roadmaps[i].edge(a[i], b[i]), mode, names[j], a[j]
-                ):
+                elif not self.validity.against(names[i], self.roadmaps[i].edge(a[i], b[i]), mode, names[j], a[j]):
                     return False
         return True

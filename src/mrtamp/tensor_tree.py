@@ -1,7 +1,8 @@
 """The tensor-product search tree T: nodes are (mode, one roadmap vertex per robot); the product is never built.
 
-Motion nodes follow their parent by one synchronous step in which each robot moves along one edge of its roadmap or stays;
-transition nodes follow theirs by a change of mode at the same vertices (paper, section V; dRRT*, Shome et al. 2020).
+Motion nodes follow their parent by one synchronous step in which each robot moves along one edge of its roadmap or
+stays; transition nodes follow theirs by a change of mode at the same vertices (paper, section V; dRRT*, Shome et al.
+2020).
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Which roadmap edges are free in which mode: factored and cached answers, computed when first asked for.
 
-A mode's verdict on an edge is the conjunction of factors that outlive the mode: robot and load against the static world,
-against each resting object at its pose, and against each other robot.  A new mode re-checks only what changed in it.
+A mode's verdict on an edge is the conjunction of factors that outlive the mode: robot and load against the static
+world, against each resting object at its pose, and against each other robot.  A new mode re-checks only what changed
+in it.
 """
 
 from __future__ import annotations
@@ -269,5 +270,5 @@ class Validity:
             return
         for robot in moving or [one]:
             other = two if robot == one else one
-            key = (robot, mode.held.get(robot), other, a[other], mode.held.get(other))
-            self.label(key).put(edges[robot], False)
+            factor = self.label((robot, mode.held.get(robot), other, a[other], mode.held.get(other)))
+            factor.put(edges[robot], False)

@@ -15,17 +15,33 @@ from mrtamp.kinematics import inverse, matrix, rotation_vectors
 from mrtamp.problem import AntipodalGrasps, ExplicitGrasp, MovableObject, Shape, Support
 from mrtamp.resting import face_normal, face_rotation, rest_height
 
+
 class Family(Protocol):
     """A k-parameter set of relative poses.
 
-    `lower`, `upper` (k,) bound the coordinates; `rows` are the independent rows (of rotation vector, then translation) of
-    the residual log(X(c(Y))^-1 Y) for a relative pose Y near the family.
+    `lower`, `upper` (k,) bound the coordinates; `rows` are the independent rows (of rotation vector, then
+    translation) of the residual log(X(c(Y))^-1 Y) for a relative pose Y near the family.
     """
 
-    name: str
-    lower: np.ndarray
-    upper: np.ndarray
-    rows: tuple[int, ...]
+    @property
+    def name(self) -> str:
+        """What tells it from the other families."""
+        ...
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Lower bounds (k,)."""
+        ...
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Upper bounds (k,)."""
+        ...
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """Independent rows of the residual."""
+        ...
 
     def pose(self, c: np.ndarray) -> np.ndarray:
         """Members (N, 4, 4) at coordinates (N, k)."""
@@ -286,6 +302,7 @@ class RegionPlacement:
 
 
 PlacementFamily = FixedFamily | RegionPlacement
+
 
 def placement_families(item: MovableObject, support: Support, package_paths: tuple = ()) -> list[PlacementFamily]:
     """All families of poses X_BO in which `item` rests on `support` (none where the support does not admit it)."""

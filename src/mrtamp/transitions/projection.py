@@ -1,7 +1,7 @@
 """Projection onto transition strata by inverse kinematics, batched in numpy.
 
-Damped Gauss-Newton with the damping of Sugihara (2011): the square of the error plus a constant, so that it is Newton near a
-solution and gradient descent far from one.  Joint limits are kept by clipping every iterate.
+Damped Gauss-Newton with the damping of Sugihara (2011): the square of the error plus a constant, so that it is Newton
+near a solution and gradient descent far from one.  Joint limits are kept by clipping every iterate.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def solve_ik(
 
 
 def uniform_configurations(tool: Tool, rng: np.random.Generator, n: int) -> np.ndarray:
-    """n configurations (n, dof), uniform within the joint limits (unlimited joints: one turn, or one metre, each way)."""
+    """n configurations (n, dof), uniform within the limits (unlimited joints: half a turn, or one metre, each way)."""
     limit = np.where(tool.chain.prismatic, 1.0, np.pi)
     lower = np.where(np.isfinite(tool.chain.lower), tool.chain.lower, -limit)
     upper = np.where(np.isfinite(tool.chain.upper), tool.chain.upper, limit)
@@ -80,7 +80,7 @@ def uniform_configurations(tool: Tool, rng: np.random.Generator, n: int) -> np.n
 def mixed_seeds(
     tool: Tool, rng: np.random.Generator, n: int, near: np.ndarray, spread: float = 0.5, share: float = 0.6
 ) -> np.ndarray:
-    """IK seeds (n, dof): a share around configurations `near` (M, dof) for short motions, the rest uniform for coverage."""
+    """IK seeds (n, dof): a share around `near` (M, dof) for short motions, the rest uniform for coverage."""
     q = uniform_configurations(tool, rng, n)
     local = rng.random(n) < share
     rows = rng.integers(len(near), size=n)

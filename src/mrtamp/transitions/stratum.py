@@ -27,8 +27,8 @@ class Stratum:
     """An elementary stratum.  Y(q) = inverse(base) * X_WG(q_last) * offset must belong to `family`.
 
     `base` is constant (4, 4) for a pick (X_WO) or a place (X_WB of the support's body), and the held object's pose
-    X_WG(q_0) * X_GO of the giver for a handover, when `giver_X_GO` is set.  `offset` is X_GO of what the active robot holds
-    for a place, else the identity.
+    X_WG(q_0) * X_GO of the giver for a handover, when `giver_X_GO` is set.  `offset` is X_GO of what the active robot
+    holds for a place, else the identity.
     """
 
     kind: str

@@ -1,0 +1,53 @@
+"""What transition sampling yields, and what it counts."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from mrtamp.modes import Attachment
+from mrtamp.plan import Action
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An elementary transition that stands on roadmap vertices.
+
+    `at` maps each active robot to its contact vertex.  `base` is the chain of attachments of the object it is placed
+    on or picked from (empty for a static body): the candidate exists only while that object is there.  `promising` is
+    the sampler's guess that what is gained can be put down at its goal; guidance prefers such candidates.
+    """
+
+    kind: str
+    robots: tuple[str, ...]
+    at: Mapping[str, int]
+    before: Attachment
+    after: Attachment
+    base: tuple[Attachment, ...] = ()
+    promising: bool = True
+
+    @property
+    def object(self) -> str:
+        """The object that changes hands."""
+        return self.after.object
+
+    @property
+    def action(self) -> Action:
+        """The change of attachment, without the vertices."""
+        return Action(self.kind, self.robots, self.before, self.after)
+
+
+StratumKey = tuple[str, tuple[str, ...], str, str]
+"""Kind, robots, object, and the place it comes from (pick), goes to (place) or the giver (handover)."""
+
+
+@dataclass
+class Outcome:
+    """What became of the samples of one stratum."""
+
+    calls: int = 0
+    samples: int = 0
+    ik_solved: int = 0
+    accepted: int = 0
+    collisions: Counter[str] = field(default_factory=Counter)

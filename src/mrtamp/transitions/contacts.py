@@ -1,0 +1,182 @@
+"""Contact configurations on the roadmaps: checked, and joined to the rest by approach, lift and retreat motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mrtamp.modes import Attachment, Mode
+from mrtamp.roadmap import Roadmap
+from mrtamp.transitions.candidate import Outcome
+from mrtamp.transitions.workspace import Workspace
+
+APPROACH = (0.07, 0.15, 0.25)
+"""Distances (m) of the approach vertices from a contact vertex, along the hand's approach direction."""
+LIFT = (0.04, 0.12, 0.22)
+"""Distances (m) of the lift vertices along the support's normal, where the hand does not come from there."""
+_CHAIN_JUMP = 1.0
+"""Largest change (rad) of a joint between neighbours of a chain: more would be another arm posture."""
+_EXCHANGE_SAMPLES = 8
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+class ContactBuilder:
+    """Puts transition configurations that are valid for their robots alone onto the roadmaps."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace = workspace
+        self.problem = workspace.problem
+        self.roadmaps = workspace.roadmaps
+        self.validity = workspace.validity
+        self._normals = {s.name: s.X_BS.rotation().matrix()[:, 2] for s in self.problem.supports}
+
+    def contact(
+        self,
+        robot: str,
+        placement: Attachment,
+        chain: tuple[Attachment, ...],
+        grasp: Attachment,
+        q: np.ndarray,
+        stats: Outcome,
+        mode: Mode,
+    ) -> int | None:
+        """Check a contact configuration alone and put it, with its approach and lift chains, on the roadmap."""
+        roadmap = self.roadmaps[robot]
+        world = roadmap.world
+        item = grasp.object
+        slot = world.slot_of[item]
+        below = {a.object: self.validity.world_pose(chain[k:]) for k, a in enumerate(chain) if k > 0}
+        # What stands in the way now is a reason not to act now; the counts tell the guidance who it is.
+        around = {r.name: r.X_WO for r in self.validity.resting(mode) if r.name != item} | below
+        holding = world.rows(q[None], grasp, around)
+        if world.first_hit(holding, placement.parent, slot) >= 0:
+            self._blame(stats, world.culprits(holding[0], placement.parent, slot), {robot, slot})
+            return None
+        open_hand = world.rows(q[None], None, {**around, item: self.validity.world_pose(chain)})
+        if world.first_hit(open_hand) >= 0:
+            self._blame(stats, world.culprits(open_hand[0]), {robot})
+            return None
+        X_WG = world.tool.matrix(q[None])[0]
+        normal = self._normal(placement, chain)
+        away = -X_WG[:3, 2]
+        same = float(away @ normal) > 1 - 1e-6
+        approach = self._chain(robot, q, X_WG, away, APPROACH)
+        lift = approach if same else self._chain(robot, q, X_WG, normal, LIFT)
+        if not len(approach) or not len(lift):
+            stats.collisions["no approach"] += 1
+            return None
+        v = roadmap.add_vertex(q, connect=False)
+        roadmap.contact[roadmap.edge(v, v)] = (item, placement.parent)
+        exits = self._attach(roadmap, v, approach, (item, placement.parent) if same else None)
+        if not same:
+            exits += self._attach(roadmap, v, lift, (item, placement.parent))
+        roadmap.exits[v] = exits
+        return v
+
+    def _blame(self, stats: Outcome, culprits: list[tuple[str, str]], self_names: set[str]) -> None:
+        for a, b in culprits:
+            others = [x for x in (a, b) if x not in self_names]
+            stats.collisions[others[0] if others else "itself"] += 1
+
+    def _normal(self, placement: Attachment, chain: tuple[Attachment, ...]) -> np.ndarray:
+        normal = self._normals.get(placement.support or "")
+        if normal is None:
+            return _UP
+        X_WB = self.validity.world_pose(chain[1:]) if len(chain) > 1 else self.validity.X_WB[placement.parent]
+        return X_WB[:3, :3] @ normal
+
+    def _chain(
+        self, robot: str, q: np.ndarray, X_WG: np.ndarray, direction: np.ndarray, distances: Sequence[float]
+    ) -> list[np.ndarray]:
+        """Configurations along a straight retreat of the hand, as far as they continue q without a jump."""
+        targets = np.tile(X_WG, (len(distances), 1, 1))
+        targets[:, :3, 3] += np.outer(distances, direction)
+        found, solved = self.workspace.ik(robot, targets, np.tile(q, (len(distances), 1)))
+        out: list[np.ndarray] = []
+        last = q
+        for x, ok in zip(found, solved, strict=True):
+            if not ok or np.abs(x - last).max() > _CHAIN_JUMP:
+                break
+            out.append(x)
+            last = x
+        return out
+
+    def _attach(
+        self, roadmap: Roadmap, v: int, chain: Sequence[np.ndarray], contact: tuple[str, str] | None
+    ) -> list[int]:
+        last, exits = v, []
+        for x in chain:
+            i = roadmap.add_vertex(x)
+            e = roadmap.edge(last, i)
+            if contact is not None and last == v:
+                roadmap.contact[e] = contact
+            exits.append(i)
+            last = i
+        return exits
+
+    def exchange(
+        self,
+        mode: Mode,
+        giver: str,
+        receiver: str,
+        given: Attachment,
+        taken: Attachment,
+        qa: np.ndarray,
+        qb: np.ndarray,
+        stats: Outcome,
+    ) -> dict[str, int] | None:
+        """Check a handover configuration before and after, and put both contact vertices on their roadmaps."""
+        worlds = [self.roadmaps[r].world for r in (giver, receiver)]
+        for world, q, grasp in ((worlds[0], qa, given), (worlds[1], qb, taken)):
+            for held in (grasp, None):
+                rows = world.rows(q[None], held, {})
+                if world.first_hit(rows) >= 0:
+                    self._blame(stats, world.culprits(rows[0]), {world.name, *world.slot_of.values()})
+                    return None
+        pair, swapped = self.workspace.collision.pair(giver, receiver)
+        # The receiver's fingers close before the giver's open; both are looked at on their way.
+        stages: list[tuple[Attachment | None, Attachment | None, tuple[float | None, float | None]]] = [
+            (given, None, (None, None)),
+            *((None, None, (given.width, w)) for w in self._widths(receiver, taken)),
+            *((None, None, (w, taken.width)) for w in self._widths(giver, given)),
+            (None, taken, (None, None)),
+        ]
+
+        def apart(
+            a: np.ndarray, ha: Attachment | None, b: np.ndarray, hb: Attachment | None, w: tuple = (None, None)
+        ) -> bool:
+            hit = pair.first_hit(b, hb, a, ha, w[::-1]) if swapped else pair.first_hit(a, ha, b, hb, w)
+            return hit < 0
+
+        if not all(apart(qa[None], ha, qb[None], hb, widths) for ha, hb, widths in stages):
+            stats.collisions["each other"] += 1
+            return None
+        chains = []
+        for robot, q, world in ((giver, qa, worlds[0]), (receiver, qb, worlds[1])):
+            X_WG = world.tool.matrix(q[None])[0]
+            chain = self._chain(robot, q, X_WG, -X_WG[:3, 2], APPROACH[:2])
+            if not chain:
+                stats.collisions["no approach"] += 1
+                return None
+            chains.append((robot, q, chain))
+        # The receiver comes in while the giver holds, the giver leaves while the receiver holds.
+        leave = np.linspace(qa, chains[0][2][0], _EXCHANGE_SAMPLES)
+        enter = np.linspace(qb, chains[1][2][0], _EXCHANGE_SAMPLES)
+        stay_a, stay_b = np.tile(qa, (_EXCHANGE_SAMPLES, 1)), np.tile(qb, (_EXCHANGE_SAMPLES, 1))
+        if not (apart(stay_a, given, enter, None) and apart(leave, None, stay_b, taken)):
+            stats.collisions["no approach"] += 1
+            return None
+        at: dict[str, int] = {}
+        for robot, q, chain in chains:
+            roadmap = self.roadmaps[robot]
+            v = roadmap.add_vertex(q, connect=False)
+            roadmap.exits[v] = self._attach(roadmap, v, chain, None)
+            at[robot] = v
+        return at
+
+    def _widths(self, robot: str, grasp: Attachment) -> np.ndarray:
+        """Opening widths (m) from open to closed on the object."""
+        gripper = self.problem.robot(robot).model.gripper
+        assert gripper is not None and grasp.width is not None
+        return np.linspace(gripper.max_width, grasp.width, 5)

@@ -1,0 +1,162 @@
+"""What all transition samplers share: reach, grasp families, IK with counts, and a look ahead to the goal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from mrtamp.collision import Collision
+from mrtamp.kinematics import inverse
+from mrtamp.modes import Attachment, Mode
+from mrtamp.problem import AtPose, InRegion, Problem, Support
+from mrtamp.roadmap import Roadmap
+from mrtamp.transitions.candidate import Outcome, StratumKey
+from mrtamp.transitions.families import FixedFamily, GraspFamily, grasp_families, placement_families
+from mrtamp.transitions.projection import solve_ik, uniform_configurations
+from mrtamp.validity import Validity
+
+
+class Workspace:
+    """The scene as the samplers see it.
+
+    Attributes
+    ----------
+    families : (robot, object) -> grasp families that fit the robot's gripper.
+    reach : robot -> centre (3,) and radius (m) of a ball that holds every grasp point seen in random configurations.
+    goal_supports : object -> supports on which it satisfies its goal.
+    outcomes : what became of all samples, per stratum.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        collision: Collision,
+        roadmaps: Mapping[str, Roadmap],
+        validity: Validity,
+        rng: np.random.Generator,
+    ) -> None:
+        self.problem = problem
+        self.collision = collision
+        self.roadmaps = roadmaps
+        self.validity = validity
+        self.rng = rng
+        self.outcomes: dict[StratumKey, Outcome] = {}
+        self._grasps: dict[tuple[str, str, int], Attachment] = {}
+        self.families: dict[tuple[str, str], list[GraspFamily]] = {}
+        self.reach: dict[str, tuple[np.ndarray, float]] = {}
+        for robot in problem.robots:
+            gripper = robot.model.gripper
+            for item in problem.objects:
+                fits = grasp_families(item, gripper.max_width) if gripper else []
+                self.families[robot.name, item.name] = fits
+            tool = roadmaps[robot.name].world.tool
+            spread = tool.pose(uniform_configurations(tool, np.random.default_rng(0), 2000))[1]
+            centre = spread.mean(axis=0)
+            self.reach[robot.name] = (centre, float(np.linalg.norm(spread - centre, axis=1).max()))
+        self.goal_supports: dict[str, list[Support]] = {
+            o.name: _goal_supports(problem, o.name) for o in problem.objects
+        }
+
+    def outcome(self, key: StratumKey) -> Outcome:
+        """Statistics of a stratum."""
+        return self.outcomes.setdefault(key, Outcome())
+
+    def in_reach(self, robot: str, p: np.ndarray) -> bool:
+        """Whether a point lies inside the ball that the robot's grasp point was seen to reach."""
+        centre, radius = self.reach[robot]
+        return bool(np.linalg.norm(p - centre) <= radius)
+
+    def body_pose(self, mode: Mode, body: str) -> np.ndarray:
+        if body in mode.of:
+            return self.validity.world_pose(mode.chain(body))
+        return self.validity.X_WB[body]
+
+    def near(self, robot: str) -> np.ndarray:
+        """Configurations around which short motions are likely: home and some open roadmap vertices."""
+        roadmap = self.roadmaps[robot]
+        open_vertices = roadmap.open_vertices()
+        rows = self.rng.integers(len(open_vertices), size=4)
+        return np.vstack(
+            [roadmap.world.home[None], roadmap.world.home[None], roadmap.q[[open_vertices[i] for i in rows]]]
+        )
+
+    def ik(self, robot: str, X_WG: np.ndarray, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        q, solved = solve_ik(self.roadmaps[robot].world.tool, X_WG[:, :3, :3], X_WG[:, :3, 3], seeds)
+        self.collision.counts.ik_attempts += len(q)
+        self.collision.counts.ik_successes += int(solved.sum())
+        return q, solved
+
+    def grasp(self, robot: str, item: str, family: GraspFamily, index: int, c: np.ndarray) -> Attachment:
+        X_GO = inverse(family.pose(c[None]))[0]
+        if isinstance(family, FixedFamily):
+            key = (robot, item, index)
+            if key not in self._grasps:
+                self._grasps[key] = Attachment(item, robot, X_GO, None, family.width)
+            return self._grasps[key]
+        return Attachment(item, robot, X_GO, None, family.width)
+
+    def draw_grasp(self, robot: str, item: str, f: int) -> Attachment:
+        family = self.families[robot, item][f]
+        return self.grasp(robot, item, family, f, self.rng.uniform(family.lower, family.upper))
+
+    def look_ahead(self, mode: Mode, robot: str, item: str, grasps: Sequence[Attachment], q: np.ndarray) -> np.ndarray:
+        """Joint distance from q to a place at the object's goal with each grasp; infinite where none was found.
+
+        The places are solved by IK and free of collision with the world as it is fixed, nothing more: a ranking, not a
+        filter.
+        """
+        reward = np.full(len(grasps), np.inf)
+        if not len(grasps):
+            return reward
+        world = self.roadmaps[robot].world
+        places: list[tuple[Support, dict[str, np.ndarray], np.ndarray]] = []
+        for support in self.goal_supports[item]:
+            body = support.body
+            if body in mode.of and mode.of[body].held:
+                continue
+            chain = mode.chain(body) if body in mode.of else ()
+            below = {a.object: self.validity.world_pose(chain[k:]) for k, a in enumerate(chain)}
+            for f in placement_families(self.problem.object(item), support, self.problem.package_paths):
+                c = self.rng.uniform(f.lower, f.upper, size=(len(grasps), len(f.lower)))
+                places.append((support, below, self.body_pose(mode, body) @ f.pose(c)))
+        if not places:
+            return reward
+        # What is found out here about the places is what sampling them would have found out.
+        for name in dict.fromkeys(support.name for support, _, _ in places):
+            self.outcome(("place", (robot,), item, name)).calls += 1
+        if not any(self.in_reach(robot, X[0, :3, 3]) for _, _, X in places):
+            return reward
+        which = self.rng.integers(len(places), size=len(grasps)).tolist()
+        X_WO = np.array([places[k][2][i] for i, k in enumerate(which)])
+        X_WG = X_WO @ inverse(np.array([g.X_PO for g in grasps]))
+        seeds = np.where(self.rng.random(len(q))[:, None] < 0.5, q, world.home)
+        found, solved = self.ik(robot, X_WG, seeds + self.rng.normal(scale=0.3, size=q.shape))
+        for i in np.flatnonzero(solved):
+            support, below, _ = places[which[i]]
+            stats = self.outcome(("place", (robot,), item, support.name))
+            stats.ik_solved += 1
+            rows = world.rows(found[i][None], grasps[i], below)
+            if world.first_hit(rows, support.body, world.slot_of[item]) < 0:
+                reward[i] = np.linalg.norm(found[i] - q[i])
+                stats.accepted += 1
+        return reward
+
+
+def _goal_supports(problem: Problem, item: str) -> list[Support]:
+    out: list[Support] = []
+    for condition in problem.goal:
+        if isinstance(condition, InRegion) and condition.object == item:
+            out.append(problem.support(condition.region))
+        elif isinstance(condition, AtPose) and condition.object == item:
+            out += [s for s in problem.supports if s.body == condition.on and _serves(s, condition, item)]
+    return out
+
+
+def _serves(support: Support, goal: AtPose, item: str) -> bool:
+    """Whether putting `item` on `support` achieves the pose goal."""
+    if support.objects is not None and item not in support.objects:
+        return False
+    if goal.X_BO is None:
+        return True
+    return support.X_BO is not None and support.X_BO.IsNearlyEqualTo(goal.X_BO, 1e-6)
