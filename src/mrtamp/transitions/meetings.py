@@ -8,10 +8,11 @@ import numpy as np
 
 from mrtamp.kinematics import inverse, matrix
 from mrtamp.modes import Attachment, Mode
-from mrtamp.transitions.projection import mixed_seeds, uniform_configurations
+from mrtamp.transitions.projection import uniform_configurations
 from mrtamp.transitions.workspace import Workspace
 
 _GRASP_DRAWS = 8
+_ROLLS = 4
 _POOL = 48
 """Grasps per robot and object that are known to lead on to the goal; enough to choose from."""
 _ROOM = 0.3
@@ -70,11 +71,21 @@ class Meetings:
         X_OG2 = inverse(np.array([g.X_PO for g in aimed]))
         across = _palms(X_OG2) - _palms(X_OG1)
         ahead = (centre - own) / max(gap, 1e-9)
-        turn = _rotations_about(ahead, self.rng.uniform(-np.pi, np.pi, size=n))
-        R = _random_rotations(self.rng, n, 0.4) @ turn @ np.swapaxes(_rotations_to(across), 1, 2)
         middle = (X_OG1[:3, 3] + X_OG2[:, :3, 3]) / 2
-        X_WO = matrix(R, where - np.einsum("nij,nj->ni", R, middle))
-        q, solved = self.workspace.ik(giver, X_WO @ X_OG1, mixed_seeds(tool, self.rng, n, self.workspace.near(giver)))
+        rolls = []
+        for _ in range(_ROLLS):
+            turn = _rotations_about(ahead, self.rng.uniform(-np.pi, np.pi, size=n))
+            R = _random_rotations(self.rng, n, 0.4) @ turn @ np.swapaxes(_rotations_to(across), 1, 2)
+            rolls.append(matrix(R, where - np.einsum("nij,nj->ni", R, middle)))
+        # Mostly the roll that both arms are most at ease with; one in four is the first drawn.
+        maps = self.workspace.maps
+        ease = [
+            maps[giver].distances(X @ X_OG1).min(axis=1) + maps[receiver].distances(X @ X_OG2).min(axis=1)
+            for X in rolls
+        ]
+        best = np.where(self.rng.random(n) < 0.75, np.argmin(ease, axis=0), 0)
+        X_WO = np.array(rolls)[best, np.arange(n)]
+        q, solved = self.workspace.ik(giver, X_WO @ X_OG1, self.workspace.seeds(giver, X_WO @ X_OG1, 0.6))
         qa = np.concatenate([q[solved], uniform])
         grasps = [*(g for g, ok in zip(aimed, solved, strict=True) if ok), *free]
         clear = ~world.hits(world.rows(qa, grasp, {}))

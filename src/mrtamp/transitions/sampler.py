@@ -20,7 +20,6 @@ from mrtamp.transitions.candidate import Candidate, Outcome
 from mrtamp.transitions.contacts import ContactBuilder
 from mrtamp.transitions.families import FixedFamily, placement_families
 from mrtamp.transitions.meetings import Meetings
-from mrtamp.transitions.projection import mixed_seeds
 from mrtamp.transitions.stratum import Stratum
 from mrtamp.transitions.workspace import Workspace
 from mrtamp.validity import Validity
@@ -178,13 +177,11 @@ class TransitionSampler(Workspace):
         if not len(qa):
             return []
         stats.samples += len(qa)
-        tool = self.roadmaps[receiver].world.tool
         X_WO = self.roadmaps[giver].world.tool.matrix(qa) @ grasp.X_PO
         X_OG = inverse(np.array([g.X_PO for g in grasps]))
         # Most meeting places are near the edge of both arms' reach: several seeds each.
         X_WG = np.repeat(X_WO @ X_OG, _SEEDS, axis=0)
-        seeds = mixed_seeds(tool, self.rng, len(X_WG), self.near(receiver))
-        found, each = (x.reshape(len(qa), _SEEDS, -1) for x in self.ik(receiver, X_WG, seeds))
+        found, each = (x.reshape(len(qa), _SEEDS, -1) for x in self.ik(receiver, X_WG, self.seeds(receiver, X_WG, 0.6)))
         solved = each[:, :, 0].any(axis=1)
         qb = found[np.arange(len(qa)), np.argmax(each[:, :, 0], axis=1)]
         stats.ik_solved += int(solved.sum())
@@ -197,10 +194,10 @@ class TransitionSampler(Workspace):
         promising = np.isfinite(reward)
         if not self.meetings.pools.get((receiver, item)):
             promising[:] = True
-        elif not promising.any():
-            # Nothing here can be put down where it belongs: one such handover is enough.
-            keep = 1
-        for k in self._mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON))[: 8 * keep]:
+        order = self._mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON))
+        # Of those that cannot be put down where they belong afterwards, a few are enough.
+        order = np.concatenate([order[promising[order]][: 4 * keep], order[~promising[order]][:2]])
+        for k in order:
             at = self.contacts.exchange(mode, giver, receiver, grasp, grasps[k], qa[rows[k]], qb[rows[k]], stats)
             if at is not None:
                 candidate = Candidate("handover", (giver, receiver), at, grasp, grasps[k], promising=bool(promising[k]))
@@ -230,8 +227,7 @@ class TransitionSampler(Workspace):
             return None
         family, targets = family[near], targets[near]
         choices = [c for c, ok in zip(choices, near, strict=True) if ok]
-        tool = self.roadmaps[robot].world.tool
-        q, solved = self.ik(robot, targets, mixed_seeds(tool, self.rng, len(targets), self.near(robot)))
+        q, solved = self.ik(robot, targets, self.seeds(robot, targets))
         stats.ik_solved += int(solved.sum())
         if not solved.any():
             return None

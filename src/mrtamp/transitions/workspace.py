@@ -13,7 +13,8 @@ from mrtamp.problem import AtPose, InRegion, Problem, Support
 from mrtamp.roadmap import Roadmap
 from mrtamp.transitions.candidate import Outcome, StratumKey
 from mrtamp.transitions.families import FixedFamily, GraspFamily, grasp_families, placement_families
-from mrtamp.transitions.projection import solve_ik, uniform_configurations
+from mrtamp.transitions.projection import mixed_seeds, solve_ik
+from mrtamp.transitions.reachability import ReachabilityMap
 from mrtamp.validity import Validity
 
 
@@ -23,6 +24,7 @@ class Workspace:
     Attributes
     ----------
     families : (robot, object) -> grasp families that fit the robot's gripper.
+    maps : robot -> its reachability map.
     reach : robot -> centre (3,) and radius (m) of a ball that holds every grasp point seen in random configurations.
     goal_supports : object -> supports on which it satisfies its goal.
     outcomes : what became of all samples, per stratum.
@@ -44,16 +46,16 @@ class Workspace:
         self.outcomes: dict[StratumKey, Outcome] = {}
         self._grasps: dict[tuple[str, str, int], Attachment] = {}
         self.families: dict[tuple[str, str], list[GraspFamily]] = {}
+        self.maps: dict[str, ReachabilityMap] = {}
         self.reach: dict[str, tuple[np.ndarray, float]] = {}
         for robot in problem.robots:
             gripper = robot.model.gripper
             for item in problem.objects:
                 fits = grasp_families(item, gripper.max_width) if gripper else []
                 self.families[robot.name, item.name] = fits
-            tool = roadmaps[robot.name].world.tool
-            spread = tool.pose(uniform_configurations(tool, np.random.default_rng(0), 2000))[1]
-            centre = spread.mean(axis=0)
-            self.reach[robot.name] = (centre, float(np.linalg.norm(spread - centre, axis=1).max()))
+            reachable = ReachabilityMap(roadmaps[robot.name].world.tool)
+            self.maps[robot.name] = reachable
+            self.reach[robot.name] = (reachable.centre, reachable.radius)
         self.goal_supports: dict[str, list[Support]] = {
             o.name: _goal_supports(problem, o.name) for o in problem.objects
         }
@@ -80,6 +82,15 @@ class Workspace:
         return np.vstack(
             [roadmap.world.home[None], roadmap.world.home[None], roadmap.q[[open_vertices[i] for i in rows]]]
         )
+
+    def seeds(self, robot: str, X_WG: np.ndarray, share: float = 0.1) -> np.ndarray:
+        """IK seeds (N, n) for hand poses: a share from the map, the rest around home and the roadmap, or uniform.
+
+        Seeds from the map converge where reach is scarce; those around home give postures that are cheap to get to.
+        """
+        tool = self.roadmaps[robot].world.tool
+        mixed = mixed_seeds(tool, self.rng, len(X_WG), self.near(robot))
+        return np.where(self.rng.random(len(X_WG))[:, None] < share, self.maps[robot].seeds(X_WG, self.rng), mixed)
 
     def ik(self, robot: str, X_WG: np.ndarray, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         q, solved = solve_ik(self.roadmaps[robot].world.tool, X_WG[:, :3, :3], X_WG[:, :3, 3], seeds)
@@ -130,9 +141,11 @@ class Workspace:
         which = self.rng.integers(len(places), size=len(grasps)).tolist()
         X_WO = np.array([places[k][2][i] for i, k in enumerate(which)])
         X_WG = X_WO @ inverse(np.array([g.X_PO for g in grasps]))
-        seeds = np.where(self.rng.random(len(q))[:, None] < 0.5, q, world.home)
+        # The posture of the pick, or of home, makes for a short way; the map helps where neither converges.
+        start = self.rng.random(len(q))[:, None]
+        seeds = np.where(start < 0.5, q, np.where(start < 0.85, world.home, self.maps[robot].seeds(X_WG, self.rng)))
         found, solved = self.ik(robot, X_WG, seeds + self.rng.normal(scale=0.3, size=q.shape))
-        for i in np.flatnonzero(solved):
+        for i in np.flatnonzero(solved).tolist():
             support, below, _ = places[which[i]]
             stats = self.outcome(("place", (robot,), item, support.name))
             stats.ik_solved += 1
