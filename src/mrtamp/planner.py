@@ -31,6 +31,8 @@ from mrtamp.transitions.projection import uniform_configurations
 from mrtamp.transitions.sampler import TransitionSampler
 from mrtamp.validity import Validity
 
+_VISIT = 0.8
+"""How much farther a modal state seems for the square root of its visits."""
 _PATIENCE = 4
 """Failures of a transition in a mode after which guidance no longer insists on promising candidates."""
 
@@ -234,7 +236,7 @@ class Planner:
                 continue
             visits = self.graphs.modal.nodes[state]["visits"]
             orbit = min(orbits, key=lambda o: self.graphs.orbital.nodes[o]["visits"])
-            score = self.guidance.remaining(self.graphs.mode(orbit)) + 0.4 * visits
+            score = self.guidance.remaining(self.graphs.mode(orbit)) + _VISIT * np.sqrt(visits)
             if score <= best:
                 best, chosen = score, orbit
         return chosen

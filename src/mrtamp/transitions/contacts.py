@@ -17,7 +17,7 @@ LIFT = (0.04, 0.12, 0.22)
 """Distances (m) of the lift vertices along the support's normal, where the hand does not come from there."""
 _CHAIN_JUMP = 1.0
 """Largest change (rad) of a joint between neighbours of a chain: more would be another arm posture."""
-_EXCHANGE_SAMPLES = 8
+_CHAIN_SAMPLES = 8
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -49,11 +49,12 @@ class ContactBuilder:
         below = {a.object: self.validity.world_pose(chain[k:]) for k, a in enumerate(chain) if k > 0}
         # What stands in the way now is a reason not to act now; the counts tell the guidance who it is.
         around = {r.name: r.X_WO for r in self.validity.resting(mode) if r.name != item} | below
+        X_WO = self.validity.world_pose(chain)
         holding = world.rows(q[None], grasp, around)
         if world.first_hit(holding, placement.parent, slot) >= 0:
             self._blame(stats, world.culprits(holding[0], placement.parent, slot), {robot, slot})
             return None
-        open_hand = world.rows(q[None], None, {**around, item: self.validity.world_pose(chain)})
+        open_hand = world.rows(q[None], None, {**around, item: X_WO})
         if world.first_hit(open_hand) >= 0:
             self._blame(stats, world.culprits(open_hand[0]), {robot})
             return None
@@ -64,6 +65,12 @@ class ContactBuilder:
         approach = self._chain(robot, q, X_WG, away, APPROACH)
         lift = approach if same else self._chain(robot, q, X_WG, normal, LIFT)
         if not len(approach) or not len(lift):
+            stats.collisions["no approach"] += 1
+            return None
+        # The first step of each chain is the only way in or out.
+        arrive = world.rows(np.linspace(q, approach[0], _CHAIN_SAMPLES), None, {**around, item: X_WO})
+        carry = world.rows(np.linspace(q, lift[0], _CHAIN_SAMPLES), grasp, around)
+        if world.first_hit(arrive) >= 0 or world.first_hit(carry, placement.parent, slot) >= 0:
             stats.collisions["no approach"] += 1
             return None
         v = roadmap.add_vertex(q, connect=False)
@@ -161,10 +168,11 @@ class ContactBuilder:
                 return None
             chains.append((robot, q, chain))
         # The receiver comes in while the giver holds, the giver leaves while the receiver holds.
-        leave = np.linspace(qa, chains[0][2][0], _EXCHANGE_SAMPLES)
-        enter = np.linspace(qb, chains[1][2][0], _EXCHANGE_SAMPLES)
-        stay_a, stay_b = np.tile(qa, (_EXCHANGE_SAMPLES, 1)), np.tile(qb, (_EXCHANGE_SAMPLES, 1))
-        if not (apart(stay_a, given, enter, None) and apart(leave, None, stay_b, taken)):
+        leave = np.linspace(qa, chains[0][2][0], _CHAIN_SAMPLES)
+        enter = np.linspace(qb, chains[1][2][0], _CHAIN_SAMPLES)
+        stay_a, stay_b = np.tile(qa, (_CHAIN_SAMPLES, 1)), np.tile(qb, (_CHAIN_SAMPLES, 1))
+        clear = apart(stay_a, given, enter, None) and apart(leave, None, stay_b, taken)
+        if not clear or any(w.first_hit(w.rows(x, None, {})) >= 0 for w, x in zip(worlds, (leave, enter), strict=True)):
             stats.collisions["no approach"] += 1
             return None
         at: dict[str, int] = {}
