@@ -395,12 +395,12 @@ def test_a_tower_is_turned_upside_down() -> None:
 POST = {"box": [0.04, 0.04, 0.12]}
 
 
-def regrasp_problem() -> dict[str, Any]:
-    """A post under a roof, to be taken from the side; its goal is a well, to be entered from above; a bench between."""
+def regrasp_problem(gap: float = 0.06) -> dict[str, Any]:
+    """A post `gap` (m) under a roof, to be taken from the side; its goal is a well, to be entered from above; a bench."""
     world = [
         *scene()["world"],
         {"name": "pedestal", "shape": {"box": [0.06, 0.06, 0.2]}, "X_WB": pose(0, 0.3, 0.1)},
-        {"name": "roof", "shape": {"box": [0.2, 0.2, 0.01]}, "X_WB": pose(0, 0.3, 0.345)},
+        {"name": "roof", "shape": {"box": [0.2, 0.2, 0.01]}, "X_WB": pose(0, 0.3, 0.325 + gap)},
         {"name": "bench", "shape": {"box": [0.2, 0.2, 0.2]}, "X_WB": pose(0.05, 0, 0.1)},
         {"name": "well_left", "shape": {"box": [0.01, 0.1, 0.075]}, "X_WB": pose(-0.045, -0.3, 0.0375)},
         {"name": "well_right", "shape": {"box": [0.01, 0.1, 0.075]}, "X_WB": pose(0.045, -0.3, 0.0375)},

@@ -5,22 +5,22 @@ Read `Planner.improve` beside the algorithm; each named step is a method below i
 
 from __future__ import annotations
 
-import platform
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib.metadata import version
 
 import numpy as np
 
-from mrtamp.check import Checker, Report
+from mrtamp.check import Report
 from mrtamp.check_report import Violation
-from mrtamp.collision import RESOLUTION, Collision, Counts
+from mrtamp.collision import Collision, Counts
 from mrtamp.explain import explain
 from mrtamp.graphs import Graphs
 from mrtamp.guidance import Choice, ModalGuidance
+from mrtamp.incumbent import Incumbent
 from mrtamp.modes import Mode, objects_done, start_mode
-from mrtamp.plan import Plan, Segment, Transition, plan_cost
+from mrtamp.plan import Plan, Transition
+from mrtamp.portfolio import Portfolio
 from mrtamp.problem import MrtampError, Problem, RobotAt
 from mrtamp.refine import Refiner
 from mrtamp.roadmap import Roadmap
@@ -37,12 +37,6 @@ _PATIENCE = 4
 """Failures of a transition in a mode after which guidance no longer insists on promising candidates."""
 
 
-_PORTFOLIO = 3
-"""Plans under refinement at once."""
-_CHANCE = 600
-"""Proposals after which plans under refinement are compared."""
-_WORTH_CHECKING = 0.005
-"""Relative gain of a refined plan that is worth a check."""
 _TIE = 0.25
 """Difference of optimistic estimates within which guidance chooses at random."""
 
@@ -65,14 +59,6 @@ class Options:
     extensions: int = 3
     persistent: float = 0.1
     refinements: int = 60
-
-
-@dataclass
-class _Candidate:
-    """A plan under refinement, and its last version that passed the check."""
-
-    refiner: Refiner
-    checked: Plan
 
 
 @dataclass(frozen=True)
@@ -100,14 +86,13 @@ class Planner:
 
     Raises
     ------
-    MrtampError : the start is in collision or a model cannot be used.
+    MrtampError : the start is not valid (a collision, an object that floats) or a model cannot be used.
     """
 
     def __init__(self, problem: Problem, *, seed: int = 0, options: Options | None = None) -> None:
         self.problem = problem
         self.seed = seed
         self.options = options or Options()
-        self.best: Plan | None = None
         self._clock = time.perf_counter()
         self._spent = 0.0
         self.rng = np.random.default_rng(seed)
@@ -123,16 +108,24 @@ class Planner:
         self.tree = TensorTree(list(self.roadmaps.values()), problem.cost)
         self.steering = Steering(list(self.roadmaps.values()), self.validity, self._insert, self.rng)
         self.iteration = 0
-        self._history: list[dict[str, float]] = []
         self._goal_vertices: dict[str, int] = {}
         self._goal_nodes: list[Node] = []
         self._path: list[int] = []
         self._tree_cost = np.inf
-        self._checker: Checker | None = None
         self._banned: set[tuple] = set()
-        self._refiners: list[_Candidate] = []
+        self.incumbent = Incumbent(problem, seed, self.counts)
+        self._portfolio = Portfolio(
+            self._refiner,
+            lambda refiner: self.incumbent.plan(refiner.segments(), refiner.transitions),
+            lambda plan: self.incumbent.judge(plan).ok,
+        )
         self._start()
         self._spent = time.perf_counter() - self._clock
+
+    @property
+    def best(self) -> Plan | None:
+        """The incumbent: the cheapest plan so far, checked; None before there is one."""
+        return self.incumbent.best
 
     # -- Algorithm 1 ----------------------------------------------------------------------------------------------
 
@@ -167,7 +160,7 @@ class Planner:
                 found = self._best_solution()
                 if self.best is not None and not (found and first):
                     found = self._refine() or found
-                self._spent = time.perf_counter() - self._clock
+                self._spent = self._elapsed()
                 if progress is not None:
                     progress(self.status())
                 if found:
@@ -176,11 +169,16 @@ class Planner:
                     if first:
                         return
         finally:
-            self._spent = time.perf_counter() - self._clock
+            self._spent = self._elapsed()
+
+    def _elapsed(self) -> float:
+        """Seconds spent planning, over all calls."""
+        return time.perf_counter() - self._clock
 
     # -- initialisation -------------------------------------------------------------------------------------------
 
     def _start(self) -> None:
+        self.incumbent.check_start()
         mode = start_mode(self.problem)
         self.sampler.remember(mode)
         at = []
@@ -193,16 +191,6 @@ class Planner:
                 if isinstance(condition, RobotAt) and condition.robot == robot.name:
                     same = np.flatnonzero(np.max(np.abs(roadmap.q - condition.q), axis=1) == 0)
                     self._goal_vertices[robot.name] = int(same[0]) if len(same) else roadmap.add_vertex(condition.q)
-        for robot, v in zip(self.problem.robots, at, strict=True):
-            where = self.validity.stand(mode, dict(zip(self.names, at, strict=True)), (robot.name,))
-            if where is not None:
-                roadmap = self.roadmaps[robot.name]
-                rows = roadmap.world.rows(roadmap.q[[v]], None, {r.name: r.X_WO for r in self.validity.resting(mode)})
-                pairs = roadmap.world.culprits(rows[0]) or [(robot.name, where)]
-                raise MrtampError(
-                    f"problem {self.problem.name}: robot {robot.name} starts in collision "
-                    f"({pairs[0][0]} with {pairs[0][1]})"
-                )
         for robot in self.problem.robots:
             self._add_interior(robot.name, self.options.initial_vertices)
         root_orbit = self.graphs.add_orbit(mode)
@@ -445,38 +433,26 @@ class Planner:
             if node is None or node.cost >= self._tree_cost - 1e-9:
                 return False
             segments, transitions, groups = self.tree.trace(node)
-            plan = self._plan(segments, transitions)
-            report = self._judge(plan)
+            plan = self.incumbent.plan(segments, transitions)
+            report = self.incumbent.judge(plan)
             if report.ok:
                 self._tree_cost = node.cost
                 self._path = [g[0].orbit for g in groups]
-                self._add_refiner(plan)
-                return self._offer(plan)
+                if self.options.refinements:
+                    self._portfolio.add(plan)
+                return self.incumbent.offer(plan, self._elapsed())
             self._repair(report, groups)
+            if node.alive:
+                self.tree.cut(node)
 
-    def _plan(self, segments: list[Segment], transitions: list[Transition]) -> Plan:
-        cost = plan_cost(segments, transitions, self.problem.cost)
-        plan = Plan(self.problem, segments, transitions, cost, seed=self.seed, versions=versions())
-        plan.history = [{"time_s": 0.0, "cost": cost}]
-        return plan
+    def _refine(self) -> bool:
+        """A share of proposals to one of the plans under refinement; a checked gain is offered."""
+        assert self.best is not None
+        plan = self._portfolio.improve(self.options.refinements, self.best.cost)
+        return plan is not None and self.incumbent.offer(plan, self._elapsed())
 
-    def _offer(self, plan: Plan) -> bool:
-        """Keep a checked plan if it beats the incumbent."""
-        if self.best is not None and plan.cost >= self.best.cost:
-            return False
-        self._history.append({"time_s": time.perf_counter() - self._clock, "cost": plan.cost})
-        plan.history = list(self._history)
-        plan.counts = self.counts.as_dict()
-        self.best = plan
-        return True
-
-    # -- refinement -----------------------------------------------------------------------------------------------
-
-    def _add_refiner(self, plan: Plan, resolution: float = RESOLUTION) -> None:
-        """Put a plan under refinement; of several, the dearest that had its chance makes room."""
-        if not self.options.refinements:
-            return
-        refiner = Refiner(
+    def _refiner(self, plan: Plan, resolution: float) -> Refiner:
+        return Refiner(
             plan.segments,
             plan.transitions,
             self.problem.cost,
@@ -486,33 +462,6 @@ class Planner:
             self.rng,
             resolution,
         )
-        self._refiners.append(_Candidate(refiner, plan))
-        if len(self._refiners) > _PORTFOLIO:
-            self._refiners.remove(max(self._refiners, key=lambda c: c.refiner.cost))
-
-    def _refine(self) -> bool:
-        """A share of proposals to one of the plans under refinement; a clear gain is checked and offered."""
-        if not self._refiners:
-            return False
-        # The newest first gets as many proposals as the others have had, then the best is favoured.
-        candidate = min(self._refiners, key=lambda c: (c.refiner.proposals // _CHANCE, c.refiner.cost))
-        candidate.refiner.improve(self.options.refinements)
-        assert self.best is not None
-        if candidate.refiner.cost > self.best.cost * (1 - _WORTH_CHECKING):
-            return False
-        plan = self._plan(candidate.refiner.segments(), candidate.refiner.transitions)
-        if self._judge(plan).ok:
-            candidate.checked = plan
-            return self._offer(plan)
-        # Something slipped between the samples: go back to what was checked and look more closely.
-        self._refiners.remove(candidate)
-        self._add_refiner(candidate.checked, candidate.refiner.resolution / 2)
-        return False
-
-    def _judge(self, plan: Plan) -> Report:
-        if self._checker is None:
-            self._checker = Checker(self.problem)
-        return self._checker.check(plan)
 
     def _repair(self, report: Report, groups: list[list[Node]]) -> None:
         """The judge found what samples had missed: forbid that step, or that change of mode, and cut the tree there."""
@@ -568,13 +517,3 @@ class Planner:
     def explain(self) -> str:
         """Why there is no plan yet: per stratum what was tried and what stopped it, and who blocked whose motion."""
         return explain(self)
-
-
-def versions() -> dict[str, str]:
-    """Versions that a plan depends on."""
-    return {
-        "mrtamp": version("mrtamp"),
-        "drake": version("drake"),
-        "numpy": version("numpy"),
-        "python": platform.python_version(),
-    }

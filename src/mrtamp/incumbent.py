@@ -1,0 +1,63 @@
+"""The best plan so far: nothing becomes it that the independent judge has not accepted."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+
+from mrtamp.check import Checker, Report
+from mrtamp.collision import Counts
+from mrtamp.modes import start_mode
+from mrtamp.plan import Plan, Segment, Transition, plan_cost
+from mrtamp.problem import MrtampError, Problem
+
+
+class Incumbent:
+    """Assembles plans, has them judged, and keeps the cheapest with the history of its cost."""
+
+    def __init__(self, problem: Problem, seed: int, counts: Counts) -> None:
+        self.problem = problem
+        self.seed = seed
+        self.counts = counts
+        self.best: Plan | None = None
+        self._history: list[dict[str, float]] = []
+        self._checker = Checker(problem)
+
+    def plan(self, segments: list[Segment], transitions: list[Transition]) -> Plan:
+        """A plan with its cost, not judged yet."""
+        cost = plan_cost(segments, transitions, self.problem.cost)
+        plan = Plan(self.problem, segments, transitions, cost, seed=self.seed, versions=versions())
+        plan.history = [{"time_s": 0.0, "cost": cost}]
+        return plan
+
+    def judge(self, plan: Plan) -> Report:
+        """The independent judge's report."""
+        return self._checker.check(plan)
+
+    def offer(self, plan: Plan, time_s: float) -> bool:
+        """Keep a plan that passed the judge if it is cheaper than the best so far."""
+        if self.best is not None and plan.cost >= self.best.cost:
+            return False
+        self._history.append({"time_s": time_s, "cost": plan.cost})
+        plan.history = list(self._history)
+        plan.counts = self.counts.as_dict()
+        self.best = plan
+        return True
+
+    def check_start(self) -> None:
+        """Refuse a problem whose start no plan can have: collisions, limits, objects that float or overlap."""
+        standing = Segment(start_mode(self.problem), {r.name: r.start[None] for r in self.problem.robots})
+        wrong = [v for v in self.judge(self.plan([standing], [])).violations if v.kind != "goal"]
+        if wrong:
+            more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+            raise MrtampError(f"problem {self.problem.name}: the start is not valid: {wrong[0].message}{more}")
+
+
+def versions() -> dict[str, str]:
+    """Versions that a plan depends on."""
+    return {
+        "mrtamp": version("mrtamp"),
+        "drake": version("drake"),
+        "numpy": version("numpy"),
+        "python": platform.python_version(),
+    }
