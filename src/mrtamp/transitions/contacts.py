@@ -81,6 +81,15 @@ class ContactBuilder:
         roadmap.exits[v] = exits
         return v
 
+    def open_hand_fits(self, mode: Mode, robot: str, item: str, q: np.ndarray, stats: Outcome) -> np.ndarray:
+        """Which configurations (N, n) put the open hand around a resting object without touching anything (N,)."""
+        world = self.roadmaps[robot].world
+        rows = world.rows(q, None, {r.name: r.X_WO for r in self.validity.resting(mode)})
+        hits = world.hits(rows)
+        for row in rows[hits]:
+            self._blame(stats, world.culprits(row), {robot})
+        return ~hits
+
     def _blame(self, stats: Outcome, culprits: list[tuple[str, str]], self_names: set[str]) -> None:
         for a, b in culprits:
             others = [x for x in (a, b) if x not in self_names]

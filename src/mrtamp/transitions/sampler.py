@@ -26,6 +26,8 @@ from mrtamp.validity import Validity
 
 _SEEDS = 3
 """IK seeds per meeting place of a handover."""
+_ROOMY = 0.85
+"""Share of the largest room seen for a second hand that a promising grasp leaves."""
 _NO_WAY_ON = 50.0
 """Ranks samples from which no way to the goal was seen behind those with one (rad)."""
 
@@ -103,17 +105,22 @@ class TransitionSampler(Workspace):
         if drawn is None:
             return []
         q, family, c, _ = drawn
-        grasps = [self.grasp(robot, item, strata[f].family, f, c[i]) for i, f in enumerate(family)]
+        fits = np.flatnonzero(self.contacts.open_hand_fits(mode, robot, item, q, stats))
+        if not len(fits):
+            return []
+        q = q[fits]
+        grasps = [self.grasp(robot, item, strata[family[i]].family, int(family[i]), c[i]) for i in fits.tolist()]
         reward = self.look_ahead(mode, robot, item, grasps, q)
         near = np.linalg.norm(q - self.roadmaps[robot].world.home, axis=1)
         promising = np.isfinite(reward)
         if not promising.any() and self.goal_supports[item]:
-            promising[:] = True
             # Somebody else will have to take it over: a grasp that leaves room for a second hand is worth a detour.
             for other in self.roadmaps:
                 if other != robot:
                     self.meetings.grow_pool(mode, other, item)
-            near = near - 30.0 * self.meetings.room(item, robot, grasps)
+            room = self.meetings.room(item, robot, grasps)
+            promising = room >= _ROOMY * room.max()
+            near = near - 30.0 * room
         order = self._mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON))
         out: list[Candidate] = []
         for i in order[: 4 * keep]:
