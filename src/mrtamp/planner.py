@@ -203,7 +203,7 @@ class Planner:
         """Orbit to work in and the elementary transitions Gamma to sample there (one per robot, disjoint)."""
         explore = self.rng.random() < self.options.persistent
         if explore:
-            orbits = list(self.graphs.orbital.nodes)
+            orbits = [o for o in self.graphs.orbital.nodes if self.tree.of_orbit.get(o)]
             orbit = orbits[int(self.rng.integers(len(orbits)))]
         elif self.best is not None:
             orbit = self._orbit_path_guidance()
@@ -219,7 +219,8 @@ class Planner:
     def _modal_frontier(self) -> int:
         """The orbit of the modal state that is optimistically nearest to the goal, visits held against it."""
         best, chosen = np.inf, 0
-        for state, orbits in self.graphs.orbits_of.items():
+        for state, known in self.graphs.orbits_of.items():
+            orbits = [o for o in known if self.tree.of_orbit.get(o)]
             if not orbits:
                 continue
             visits = self.graphs.modal.nodes[state]["visits"]
