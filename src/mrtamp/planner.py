@@ -287,7 +287,7 @@ class Planner:
             guided = len(choices) == 1 and failed < _PATIENCE
             known = self._known(mode, choice)
             if guided:
-                known = [c for c in known if c.promising]
+                known = [c for c in known if c.promising and not self._taken(mode, c)]
             # Grow the set while it is small, later in step with its logarithm, for ever.
             if len(known) < 4 or self.best is not None or self.rng.random() < 0.3 + self.options.persistent:
                 known = [*(c for c in self._sample(mode, choice) if c.promising or not guided), *known]
@@ -306,6 +306,10 @@ class Planner:
             if pick not in out:
                 out.append(pick)
         return out
+
+    def _taken(self, mode: Mode, candidate: Candidate) -> bool:
+        """Whether the tree already has the mode that a candidate leads to, and there is no plan to improve yet."""
+        return self.best is None and self.tree.entry(mode.replace(candidate.after)) is not None
 
     def _low_index(self, n: int) -> int:
         """An index below n, earlier ones more likely."""
@@ -384,6 +388,8 @@ class Planner:
             return False
         cost = sum(self.problem.cost.transitions.get(c.kind, 0.0) for c in combination)
         known = self.tree.find(mode, node.at)
+        if known is not None and known.cost <= node.cost + cost:
+            return False
         orbit = self.graphs.add_orbit(mode) if known is None else None
         transition = Transition(tuple(c.action for c in combination))
         after = self.tree.insert_transition(node, transition, mode, orbit, cost)
