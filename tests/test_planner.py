@@ -138,16 +138,16 @@ def random_scene(seed: int) -> dict[str, Any]:
     supports = [{"name": "target", "on": "table", "X_BS": pose(*spot(), 0.05), "size": [0.08, 0.08]}]
     goal: list[dict[str, Any]] = []
     holders = [r["name"] for r in robots]
+    flat_first = objects[0]["shape"].get("box", [1, 1, 1])[2] <= 0.05
     for i, name in enumerate(names):
         kind = rng.choice(["in", "at", "on", "held_by", "nothing"])
-        flat = i > 0 and "box" in objects[0]["shape"] and objects[0]["shape"]["box"][2] <= 0.05
         if kind == "in":
             goal.append({"object": name, "in": "target"})
         elif kind == "at":
             goal.append({"object": name, "at": pose(*spot(), heights[name], rng.uniform(-180, 180)), "on": "table"})
-        elif kind == "on" and flat and all(g.get("on") != names[0] for g in goal):
+        elif kind == "on" and i > 0 and flat_first and all(g.get("on") != names[0] for g in goal):
             goal.append({"object": name, "on": names[0]})
-        elif kind == "held_by" and holders:
+        elif kind == "held_by" and holders and not (i == 0 and flat_first):
             goal.append({"object": name, "held_by": holders.pop()})
     if rng.random() < 0.5 or not goal:
         goal.append({"robot": robots[0]["name"], "at": "home"})
@@ -204,7 +204,7 @@ print(fingerprint(run({name!r}, {seed}, {iterations})))
 
 
 def test_equal_seeds_give_equal_runs_in_any_process() -> None:
-    name, seed, iterations = "handover", 5, 25
+    name, seed, iterations = "stacking", 1, 20
     code = _OTHER_PROCESS.format(tests=str(Path(__file__).parent), name=name, seed=seed, iterations=iterations)
     others = [
         subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": h}, stdout=subprocess.PIPE)
@@ -221,21 +221,23 @@ def test_other_seeds_give_other_runs() -> None:
 
 
 def test_a_run_may_be_cut_in_pieces() -> None:
-    whole, pieces = run("box", 0, 12), run("box", 0, 4)
-    for n in (5, 3):
+    whole, pieces = run("box", 0, 8), run("box", 0, 3)
+    for n in (4, 1):
         list(pieces.improve(iterations=n))
-    assert pieces.iteration == whole.iteration == 12
+    assert pieces.iteration == whole.iteration == 8
     assert fingerprint(pieces) == fingerprint(whole)
 
 
 def test_every_plan_is_better_than_the_last_and_history_says_so() -> None:
     planner = Planner(mrtamp.load_problem("box"), seed=0)
-    plans = list(planner.improve(iterations=60))
+    plans = list(planner.improve(iterations=25))
     costs = [plan.cost for plan in plans]
     assert len(costs) >= 2
     assert all(b < a for a, b in itertools.pairwise(costs))
     history = plans[-1].history
-    assert [entry["cost"] for entry in history] == costs
+    recorded = [entry["cost"] for entry in history]
+    assert recorded == sorted(recorded, reverse=True)
+    assert set(costs) <= set(recorded), "one iteration may find several"
     times = [entry["time_s"] for entry in history]
     assert times == sorted(times)
     assert planner.best is plans[-1]
@@ -550,7 +552,7 @@ def test_an_arm_of_six_joints(tmp_path: Path) -> None:
 def test_a_robot_without_gripper_moves_but_does_not_grasp(tmp_path: Path) -> None:
     """It stands right where the cube has to go, and has a goal of its own elsewhere."""
     probe = six_joints(tmp_path, gripper=False)
-    start, end = np.array([0.0, 1.2, 1.1, 0.0, 0.8, 0.0]), np.array([1.8, -0.3, 1.9, 0.0, 1.5, 0.0])
+    start, end = np.array([0.0, 0.6, 1.2, 0.0, 0.9, 0.0]), np.array([1.8, -0.3, 1.9, 0.0, 1.5, 0.0])
     data = scene(
         robots=[LEFT, RIGHT],
         objects=[cube("red", -0.05, 0.3)],
@@ -573,6 +575,6 @@ def test_simultaneous_transitions_never_break_a_plan() -> None:
     problem = problem_from_dict(scene(robots=[LEFT, RIGHT], supports=[FLOOR], objects=objects, goal=goal))
     planner = Planner(problem, seed=0, options=Options(persistent=1.0))
     with at_most(60):
-        list(planner.improve(8.0))
+        list(planner.improve(4.0))
     if planner.best is not None:
         assert check_plan(planner.best).ok

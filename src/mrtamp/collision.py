@@ -298,8 +298,9 @@ def _robot_bounds(scene: Scene, name: str, chain: Chain) -> Bounds:
         if not geometries or body.name() not in chain._index:
             continue
         centre, radius = _radius(scene, geometries)
-        # Fingers travel by at most half the opening from where the chain shows them.
-        extra = gripper.max_width / 2 if gripper and body.name() in moving else 0.0
+        # The chain shows fingers fully open; they close by at most this much.
+        travel = max(abs(f) for f in gripper.joints.values()) * gripper.max_width if gripper else 0.0
+        extra = travel if body.name() in moving else 0.0
         names.append(body.name())
         centres.append(centre)
         radii.append(radius + extra)

@@ -28,6 +28,10 @@ def explain(planner: Planner) -> str:
     wanted = {c.object for c in planner.problem.goal if hasattr(c, "object")}
     for item in sorted(wanted):
         lines += _object_lines(planner, item)
+    if planner.incumbent.refused:
+        lines.append(
+            f"The check refused {planner.incumbent.refused} plans, the last for {planner.incumbent.last_refusal}"
+        )
     trouble = [(count, robot, other) for (robot, other), count in planner.steering.trouble.items()]
     if trouble:
         lines.append("Motions that failed, and what was in the way:")

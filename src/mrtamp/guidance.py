@@ -24,6 +24,8 @@ SOFT_FAILURE = 0.3
 """The same for a call in which IK succeeded; at most FAILED_CALL in all."""
 FAILED_TRY = 0.7
 """What a failure of a transition in one mode adds to it there."""
+BLOCKED = 2.0
+"""What is added to acting on an object while another stands in its way."""
 UNREACHABLE = 6.0
 """Cost added before any attempt where the place lies outside the reach that was seen of the robot."""
 
@@ -132,7 +134,9 @@ class ModalGuidance:
         if condition is not None and not condition_holds(self.problem, condition, mode, self._static):
             return False
         a = mode.of[item]
-        return a.held or a.parent not in mode.of or self.done(mode, a.parent)
+        if a.held:
+            return condition is not None
+        return a.parent not in mode.of or self.done(mode, a.parent)
 
     def remaining(self, mode: Mode) -> float:
         """Optimistic number of transitions from `mode` to a goal mode."""
@@ -144,8 +148,8 @@ class ModalGuidance:
         if self.done(mode, item):
             return 0.0
         if condition is None:
-            # Without a goal of its own, it is only in the way of what it rests on.
-            return 2.0
+            # Without a goal of its own, it only has to be put down, or taken off what it rests on.
+            return 1.0 if a.held else 2.0
         if condition_holds(self.problem, condition, mode, self._static):
             return 4.0
         return self.costs_to_goal(item).get(a.place, 2.0 + FAILED_CALL)
@@ -173,7 +177,8 @@ class ModalGuidance:
     def proposals(self, mode: Mode) -> list[tuple[float, Choice]]:
         """Enabled transitions and how much dearer than the best path each is by the estimate, lowest first."""
         out = []
-        blockers = self._blockers(mode)
+        blocked = self._blockers(mode)
+        blockers = {name for names in blocked.values() for name in names}
         enabled = self.enabled(mode)
         reserved = self._reserved(mode)
         for choice in enabled:
@@ -189,6 +194,9 @@ class ModalGuidance:
             if item in blockers or (start in self.goal_places(item) and choice.kind == "pick"):
                 # Out of the way, to anywhere.
                 detour = min(detour, 1.0)
+            if item in blocked and (choice.kind == "pick" or end in self.goal_places(item)):
+                # First what stands in its way.
+                detour += BLOCKED
             if end in reserved and reserved[end] != item:
                 # That hand is about to take something else over.
                 detour += 3.0
@@ -222,14 +230,16 @@ class ModalGuidance:
                 penalty += 0.5
         return penalty
 
-    def _blockers(self, mode: Mode) -> set[str]:
-        """Resting objects that kept others from their places or picks, by the statistics of what failed."""
-        out: set[str] = set()
-        for (kind, _robots, item, _place), outcome in self.sampler.outcomes.items():
-            if outcome.accepted or item not in mode.of or self.done(mode, item) or kind == "handover":
+    def _blockers(self, mode: Mode) -> dict[str, set[str]]:
+        """Object -> resting objects that kept it from its goal or from being picked, and are still where they were."""
+        out: dict[str, set[str]] = {}
+        for (kind, _robots, item, place), outcome in self.sampler.outcomes.items():
+            if not outcome.blockers or (kind == "place" and place not in self.goal_places(item)):
                 continue
-            out |= {name for name in outcome.collisions if name in mode.of and name != item}
-        return {name for name in out if not mode.of[name].held}
+            here = {a.object for a in outcome.blockers if mode.of[a.object] is a and a.object != item}
+            if here and not self.done(mode, item):
+                out.setdefault(item, set()).update(here)
+        return out
 
     def feasible_sets(self, mode: Mode, rng: np.random.Generator) -> list[Choice]:
         """A uniformly random non-empty active set and a random elementary transition for each of its robots.

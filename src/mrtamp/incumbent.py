@@ -20,6 +20,8 @@ class Incumbent:
         self.seed = seed
         self.counts = counts
         self.best: Plan | None = None
+        self.refused = 0
+        self.last_refusal = ""
         self._history: list[dict[str, float]] = []
         self._checker = Checker(problem)
 
@@ -32,7 +34,11 @@ class Incumbent:
 
     def judge(self, plan: Plan) -> Report:
         """The independent judge's report."""
-        return self._checker.check(plan)
+        report = self._checker.check(plan)
+        if not report.ok:
+            self.refused += 1
+            self.last_refusal = str(report.violations[0])
+        return report
 
     def offer(self, plan: Plan, time_s: float) -> bool:
         """Keep a plan that passed the judge if it is cheaper than the best so far."""
@@ -47,7 +53,8 @@ class Incumbent:
     def check_start(self) -> None:
         """Refuse a problem whose start no plan can have: collisions, limits, objects that float or overlap."""
         standing = Segment(start_mode(self.problem), {r.name: r.start[None] for r in self.problem.robots})
-        wrong = [v for v in self.judge(self.plan([standing], [])).violations if v.kind != "goal"]
+        report = self._checker.check(self.plan([standing], []))
+        wrong = [v for v in report.violations if v.kind != "goal"]
         if wrong:
             more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
             raise MrtampError(f"problem {self.problem.name}: the start is not valid: {wrong[0].message}{more}")

@@ -158,18 +158,21 @@ class Planner:
                 self._extend_tree(orbit, choices, candidates)
                 self.iteration += 1
                 found = self._best_solution()
-                if self.best is not None and not (found and first):
-                    found = self._refine() or found
                 self._spent = self._elapsed()
                 if progress is not None:
                     progress(self.status())
                 if found:
-                    assert self.best is not None
-                    yield self.best
+                    yield self._incumbent()
                     if first:
                         return
+                if self.best is not None and self._refine():
+                    yield self._incumbent()
         finally:
             self._spent = self._elapsed()
+
+    def _incumbent(self) -> Plan:
+        assert self.best is not None
+        return self.best
 
     def _elapsed(self) -> float:
         """Seconds spent planning, over all calls."""

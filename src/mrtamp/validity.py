@@ -15,7 +15,7 @@ import numpy as np
 
 from mrtamp.collision import Collision, bisection_order
 from mrtamp.modes import Attachment, Mode
-from mrtamp.problem import Problem
+from mrtamp.problem import WORLD, Problem
 from mrtamp.roadmap import Roadmap
 
 _SLACK = 0.012
@@ -55,7 +55,7 @@ class Validity:
         self.collision = collision
         self.roadmaps = roadmaps
         self.counts = collision.counts
-        self.X_WB = {s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}
+        self.X_WB = {WORLD: np.eye(4), **{s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}}
         self._labels: dict[Hashable, Label] = {}
         self._moves: dict[Hashable, bool] = {}
         self._poses: dict[tuple[Attachment, ...], np.ndarray] = {}

@@ -44,10 +44,14 @@ StratumKey = tuple[str, tuple[str, ...], str, str]
 
 @dataclass
 class Outcome:
-    """What became of the samples of one stratum."""
+    """What became of the samples of one stratum.
+
+    `blockers` are the resting objects, where they rested, that stood in the way of the last call if it yielded nothing.
+    """
 
     calls: int = 0
     samples: int = 0
     ik_solved: int = 0
     accepted: int = 0
     collisions: Counter[str] = field(default_factory=Counter)
+    blockers: set[Attachment] = field(default_factory=set)

@@ -101,19 +101,21 @@ class TransitionSampler(Workspace):
         if not strata:
             stats.collisions["gripper too small"] += 1
             return []
+        before = dict(stats.collisions)
         drawn = self._draw(robot, strata, n, stats)
         if drawn is None:
             return []
         q, family, c, _ = drawn
         fits = np.flatnonzero(self.contacts.open_hand_fits(mode, robot, item, q, stats))
         if not len(fits):
+            self._note_blockers(mode, stats, before, False)
             return []
         q = q[fits]
         grasps = [self.grasp(robot, item, strata[family[i]].family, int(family[i]), c[i]) for i in fits.tolist()]
         reward = self.look_ahead(mode, robot, item, grasps, q)
         near = np.linalg.norm(q - self.roadmaps[robot].world.home, axis=1)
-        promising = np.isfinite(reward)
-        if not promising.any() and self.goal_supports[item]:
+        promising = np.isfinite(reward) if self.goal_supports[item] else np.ones(len(reward), dtype=bool)
+        if not promising.any():
             # Somebody else will have to take it over: a grasp that leaves room for a second hand is worth a detour.
             for other in self.roadmaps:
                 if other != robot:
@@ -134,6 +136,7 @@ class TransitionSampler(Workspace):
                 stats.accepted += 1
                 if len(out) == keep:
                     break
+        self._note_blockers(mode, stats, before, bool(out))
         return out
 
     def sample_place(self, mode: Mode, robot: str, support: str, n: int = 48, keep: int = 3) -> list[Candidate]:
@@ -147,6 +150,7 @@ class TransitionSampler(Workspace):
         on_object = body in mode.of
         if not strata or (on_object and mode.of[body].held):
             return []
+        before = dict(stats.collisions)
         drawn = self._draw(robot, strata, n, stats)
         if drawn is None:
             return []
@@ -168,6 +172,7 @@ class TransitionSampler(Workspace):
                 stats.accepted += 1
                 if len(out) == keep:
                     break
+        self._note_blockers(mode, stats, before, bool(out))
         return out
 
     def sample_handover(self, mode: Mode, giver: str, receiver: str, n: int = 72, keep: int = 3) -> list[Candidate]:
@@ -214,6 +219,14 @@ class TransitionSampler(Workspace):
                 if len(out) == keep:
                     break
         return out
+
+    def _note_blockers(self, mode: Mode, stats: Outcome, before: Mapping[str, int], found: bool) -> None:
+        """Remember which resting objects a call without result ran into."""
+        if found:
+            stats.blockers.clear()
+            return
+        names = [n for n, k in stats.collisions.items() if n in mode.of and k > before.get(n, 0)]
+        stats.blockers = {mode.of[n] for n in names if not mode.of[n].held}
 
     # -- steps ----------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,144 @@
+"""Constituent roadmaps: shortest paths, lazy validation, resolution of edges, PRM* neighbours."""
+
+from __future__ import annotations
+
+import networkx as nx
+import numpy as np
+import pytest
+
+from mrtamp.collision import RESOLUTION, Counts, RobotWorld
+from mrtamp.problem import Problem, Robot
+from mrtamp.robot_file import load_robot_model
+from mrtamp.roadmap import Roadmap, lazy_path
+from mrtamp.scene import RigidTransform
+
+
+@pytest.fixture(scope="module")
+def world() -> RobotWorld:
+    panda = load_robot_model("panda")
+    home = np.array(panda.home)
+    return RobotWorld(Problem("alone", (Robot("arm", panda, RigidTransform(), home, home),), (), (), (), ()), "arm", Counts())
+
+
+@pytest.fixture
+def roadmap(world: RobotWorld) -> Roadmap:
+    """Home and 150 random configurations, more than fit into the first arrays."""
+    out = Roadmap(world)
+    out.add_vertex(world.home)
+    for q in np.random.default_rng(0).uniform(world.chain.lower, world.chain.upper, size=(150, 7)):
+        out.add_vertex(q)
+    return out
+
+
+def as_graph(roadmap: Roadmap, blocked: np.ndarray) -> nx.Graph:
+    graph = nx.Graph()
+    graph.add_nodes_from(range(roadmap.n_vertices))
+    for e, (a, b) in enumerate(roadmap.ends):
+        if not blocked[e] and a != b:
+            graph.add_edge(int(a), int(b), weight=float(roadmap.w[e]))
+    return graph
+
+
+def length(roadmap: Roadmap, path: list[int]) -> float:
+    return float(np.linalg.norm(np.diff(roadmap.q[path], axis=0), axis=1).sum())
+
+
+def test_shortest_paths_are_dijkstras(roadmap: Roadmap) -> None:
+    rng = np.random.default_rng(1)
+    for share in (0.0, 0.5, 0.9):
+        blocked = rng.random(roadmap.n_edges) < share
+        graph = as_graph(roadmap, blocked)
+        for goal in rng.integers(roadmap.n_vertices, size=15):
+            path = roadmap.shortest(0, int(goal), blocked)
+            if path is None:
+                assert not nx.has_path(graph, 0, int(goal))
+                continue
+            assert path[0] == 0 and path[-1] == goal
+            assert all(graph.has_edge(a, b) or a == b for a, b in zip(path[:-1], path[1:], strict=True))
+            assert length(roadmap, path) == pytest.approx(nx.dijkstra_path_length(graph, 0, int(goal)))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
+def test_lazy_validation_finds_the_shortest_valid_path(roadmap: Roadmap, share: float) -> None:
+    rng = np.random.default_rng(2)
+    invalid = rng.random(roadmap.n_edges) < share
+    asked: list[int] = []
+
+    def validate(e: int) -> bool:
+        asked.append(e)
+        return not invalid[e]
+
+    blocked = np.zeros(roadmap.n_edges, dtype=bool)
+    truth = as_graph(roadmap, invalid)
+    for goal in (5, 50, 100):
+        path = lazy_path(roadmap, 0, goal, blocked, validate, rounds=10_000)
+        if path is None:
+            assert not nx.has_path(truth, 0, goal)
+        else:
+            assert length(roadmap, path) == pytest.approx(nx.dijkstra_path_length(truth, 0, goal))
+    assert np.all(invalid[blocked]), "only what failed is blocked"
+    assert len(set(asked)) < 0.7 * roadmap.n_edges, "lazily"
+
+
+def test_lazy_validation_gives_up_after_the_rounds_it_was_given(roadmap: Roadmap) -> None:
+    blocked = np.zeros(roadmap.n_edges, dtype=bool)
+    assert lazy_path(roadmap, 0, 100, blocked, lambda e: False, rounds=3) is None
+    assert blocked.sum() == 3
+    assert lazy_path(roadmap, 7, 7, blocked, lambda e: False, rounds=3) == [7]
+
+
+def test_edges_are_made_once_and_undirected(roadmap: Roadmap) -> None:
+    e = roadmap.edge(3, 149)
+    assert roadmap.edge(149, 3) == e
+    assert roadmap.w[e] == pytest.approx(np.linalg.norm(roadmap.q[3] - roadmap.q[149]))
+    stand = roadmap.edge(3, 3)
+    assert roadmap.w[stand] == 0 and roadmap.n_samples(stand) == 1
+    np.testing.assert_array_equal(roadmap.path_samples(stand, 4), np.tile(roadmap.q[3], (4, 1)))
+    assert 149 in roadmap.neighbours(3) and 3 in roadmap.neighbours(149)
+    assert 3 not in roadmap.neighbours(3)
+
+
+def test_edges_are_sampled_from_end_to_end(roadmap: Roadmap) -> None:
+    e = roadmap.edge(10, 20)
+    q = roadmap.path_samples(e)
+    assert len(q) == roadmap.n_samples(e)
+    np.testing.assert_array_equal(q[0], roadmap.q[10])
+    np.testing.assert_allclose(q[-1], roadmap.q[20], atol=1e-12)
+    steps = np.diff(q, axis=0)
+    np.testing.assert_allclose(steps, np.tile(steps[0], (len(steps), 1)), atol=1e-12)
+
+
+def test_no_tracked_point_moves_more_than_the_resolution_between_samples(roadmap: Roadmap) -> None:
+    """On steps of the size that a k-nearest roadmap and approach chains have, of all directions."""
+    rng = np.random.default_rng(3)
+    worst = []
+    for scale in (0.02, 0.1, 0.3, 0.8):
+        for _ in range(20):
+            a = int(rng.integers(roadmap.n_vertices))
+            chain = roadmap.world.chain
+            b = roadmap.add_vertex(np.clip(roadmap.q[a] + rng.normal(scale=scale, size=7), chain.lower, chain.upper), connect=False)
+            spheres = roadmap.spheres(roadmap.edge(a, b)).astype(float)
+            worst.append(np.linalg.norm(np.diff(spheres, axis=0), axis=2).max())
+    assert max(worst) <= 1.02 * RESOLUTION, f"{max(worst) * 1e3:.1f} mm"
+
+
+def test_neighbours_grow_with_the_logarithm(roadmap: Roadmap) -> None:
+    """PRM* asks for k >= e (1 + 1/d) log n."""
+    n = len(roadmap.open_vertices())
+    degree = np.array([len(roadmap.neighbours(v)) for v in range(n)])
+    k = np.e * (1 + 1 / 7) * np.log(n)
+    assert degree[-1] >= k
+    assert degree.mean() < 4 * k
+
+
+def test_unconnected_vertices_are_reached_through_their_exits_only(roadmap: Roadmap) -> None:
+    v = roadmap.add_vertex(roadmap.q[0] + 0.2, connect=False)
+    assert roadmap.neighbours(v) == []
+    assert v not in roadmap.open_vertices()
+    exit_ = roadmap.add_vertex(roadmap.q[0] + 0.15)
+    roadmap.edge(v, exit_)
+    roadmap.exits[v] = [exit_]
+    roadmap.offer_direct(0, v)
+    blocked = np.zeros(roadmap.n_edges, dtype=bool)
+    assert roadmap.shortest(0, v, blocked) == [0, exit_, v], "the direct edge to the exit is offered"
+    assert roadmap.neighbours(v) == [exit_]
