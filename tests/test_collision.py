@@ -1,4 +1,4 @@
-"""Small collision plants: bisection order, held objects, contact allowances, bounds that enclose, padding between robots."""
+"""Small collision plants: bisection order, held objects, contact allowances, bounds that enclose, padding."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ def test_bisection_order_is_a_permutation_that_halves_gaps(n: int) -> None:
 def test_a_hand_around_a_cube_is_free_and_one_through_it_is_not(problem: Problem, collision: Collision) -> None:
     """The open fingers (8 cm) straddle the 4 cm cube; 3 cm aside they are in it; above it everything is free."""
     world = collision.worlds["left"]
-    q = np.array([[-0.4, 0, 0.04, 0], [-0.4, 0.03, 0.04, 0], [-0.4, 0.03, 0.2, 0], [-0.4, 0, 0.005, 0], [0, 0.6, 0.1, 0]])
+    q = np.array(
+        [[-0.4, 0, 0.04, 0], [-0.4, 0.03, 0.04, 0], [-0.4, 0.03, 0.2, 0], [-0.4, 0, 0.005, 0], [0, 0.6, 0.1, 0]]
+    )
     rows = world.rows(q, None, resting(problem))
     np.testing.assert_array_equal(world.hits(rows), [False, True, False, True, True])
     assert world.first_hit(rows[[0, 2, 4, 1]]) == 2
@@ -106,7 +108,7 @@ def test_arms_are_padded_between_robots_by_3_mm_and_hands_are_not(problem: Probl
     def meet(gap: float) -> bool:
         y = 0.12 + gap
         q = np.array([[0.0, 0.0, 0.3, 0.0]])
-        return pair.first_hit(q, None, q + [0, y, 0, 0], None) == 0
+        return pair.first_hit(q, None, q + np.array([0, y, 0, 0]), None) == 0
 
     assert meet(-0.001) and not meet(0.001)
     arm = dataclasses.replace(problem.robots[0].model.gripper, bodies=("finger_left", "finger_right"))

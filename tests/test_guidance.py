@@ -1,4 +1,4 @@
-"""Guidance on names: closed-form counts of transitions and active sets, optimistic distances, proposals that lead on."""
+"""Guidance on names: closed-form counts of transitions and active sets, optimistic distances, proposals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,11 @@ def planner_for(robots: int, cubes: int, goal: list[dict[str, Any]] | None = Non
         "mrtamp": 1,
         "name": "counting",
         "robots": [
-            {"name": f"arm{i}", "model": "panda", "X_WB": {"translation": [x, y, 0], "rotation": {"rpy_deg": [0, 0, yaw]}}}
+            {
+                "name": f"arm{i}",
+                "model": "panda",
+                "X_WB": {"translation": [x, y, 0], "rotation": {"rpy_deg": [0, 0, yaw]}},
+            }
             for i, (x, y, yaw) in enumerate(POSES[:robots])
         ],
         "world": [{"name": "table", "shape": {"box": [1.6, 1.4, 0.1]}, "X_WB": {"translation": [0, 0, -0.05]}}],

@@ -1,4 +1,4 @@
-"""Batched kinematics agree with Drake: poses, grasp frame and Jacobian of real and odd robots; rotations at their edges."""
+"""Batched kinematics agree with Drake: poses, grasp frame, Jacobian of real and odd robots; edge rotations."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ X_WB = RigidTransform(RollPitchYaw(0.3, -0.2, 1.1), [0.4, -0.2, 0.3])
 
 ODD = """
 <robot name="odd">
-  <link name="foot"/><link name="plate"/><link name="mast"/><link name="arm"/><link name="bracket"/><link name="wrist"/>
+  <link name="foot"/><link name="plate"/><link name="mast"/>
+  <link name="arm"/><link name="bracket"/><link name="wrist"/>
   <link name="pin"/><link name="tip"/><link name="branch"/>
   <joint name="bolt" type="fixed"><parent link="foot"/><child link="plate"/>
     <origin xyz="0.1 0.02 -0.03" rpy="0.1 0.2 0.3"/></joint>
@@ -38,7 +39,8 @@ ODD = """
   <joint name="roll" type="revolute"><parent link="bracket"/><child link="wrist"/>
     <origin xyz="0 0 0.2"/><axis xyz="0 -1 0"/><limit lower="-3" upper="3" effort="1" velocity="3"/></joint>
   <joint name="passive" type="revolute"><parent link="wrist"/><child link="pin"/>
-    <origin xyz="0.02 0 0" rpy="0 0.3 0"/><axis xyz="1 0 1"/><limit lower="-1" upper="1" effort="1" velocity="3"/></joint>
+    <origin xyz="0.02 0 0" rpy="0 0.3 0"/><axis xyz="1 0 1"/>
+    <limit lower="-1" upper="1" effort="1" velocity="3"/></joint>
   <joint name="cap" type="fixed"><parent link="pin"/><child link="tip"/><origin xyz="0 0 0.07" rpy="0.2 0 0"/></joint>
   <joint name="aside" type="prismatic"><parent link="arm"/><child link="branch"/><origin xyz="0 -0.1 0"/>
     <axis xyz="0 0 -1"/><limit lower="0" upper="0.2" effort="1" velocity="1"/></joint>

@@ -1,4 +1,4 @@
-"""The planner as a whole: whatever it returns is valid, equal seeds give equal runs, and what cannot be done is not done.
+"""The planner as a whole: what it returns is valid, equal seeds give equal runs, what cannot be done is not done.
 
 Scenes are small: one to three Pandas around a table, a few boxes and cylinders, every kind of goal.
 """
@@ -293,11 +293,12 @@ def test_transition_costs_are_part_of_the_cost() -> None:
 
 
 def test_objects_that_rest_on_the_world_frame() -> None:
-    """The world is a body like any other: here the table is only geometry below its region."""
+    """The world is a body like any other: here the table ends a centimetre below the region."""
+    world = [{"name": "table", "shape": {"box": [1.6, 1.4, 0.1]}, "X_WB": pose(0, 0, -0.06)}]
     floor = {"name": "floor", "on": "world", "X_BS": {"translation": [0, 0, 0]}, "size": [0.4, 0.4]}
     red = {"name": "red", "shape": CUBE, "start": {"in": "floor", "xy": [0.05, 0.1]}}
     goal = [{"object": "red", "at": pose(0, -0.2, 0.025), "on": "world"}]
-    plan = solve(problem_from_dict(scene(supports=[floor], objects=[red], goal=goal)))
+    plan = solve(problem_from_dict(scene(world=world, supports=[floor], objects=[red], goal=goal)))
     assert plan is not None
 
 
@@ -398,7 +399,7 @@ POST = {"box": [0.04, 0.04, 0.12]}
 
 
 def regrasp_problem(gap: float = 0.06) -> dict[str, Any]:
-    """A post `gap` (m) under a roof, to be taken from the side; its goal is a well, to be entered from above; a bench."""
+    """A post `gap` (m) under a roof, to be taken from the side; its goal is a well, entered from above; a bench."""
     world = [
         *scene()["world"],
         {"name": "pedestal", "shape": {"box": [0.06, 0.06, 0.2]}, "X_WB": pose(0, 0.3, 0.1)},
@@ -471,7 +472,9 @@ def gantry_scene(folder: Path, goal: tuple, gap: float = 0.0) -> Problem:
     target = Support("target", "table", RigidTransform([0.2, 0.3, 0.02]), (0.1, 0.1), yaw=(-0.5, 0.5))
     grasps = (AntipodalGrasps(("-z",), 0.005, (0.01, 0.03)),)
     objects = tuple(
-        MovableObject(name, "table", RigidTransform([x, y, 0.05]), "floor", Shape("box", (0.04, 0.04, 0.06)), grasps=grasps)
+        MovableObject(
+            name, "table", RigidTransform([x, y, 0.05]), "floor", Shape("box", (0.04, 0.04, 0.06)), grasps=grasps
+        )
         for name, x, y in (("red", -0.3, 0.0), ("blue", 0.3, -0.3))
     )
     robots = tuple(Robot(name, model, RigidTransform(), q, q) for name, q in homes.items())
@@ -497,17 +500,23 @@ _SIX = """
   <link name="wrist"><collision><origin xyz="0 0 0.06"/><geometry><capsule radius="0.03" length="0.04"/></geometry>
     </collision></link>
   <link name="knuckle"/>
-  <link name="palm"><collision><origin xyz="0 0 0.08"/><geometry><box size="0.04 0.13 0.04"/></geometry></collision></link>
-  <link name="fixed_finger"><collision><origin xyz="0 0 0"/><geometry><box size="0.02 0.01 0.06"/></geometry></collision>
+  <link name="palm"><collision><origin xyz="0 0 0.08"/><geometry><box size="0.04 0.13 0.04"/>
+    </geometry></collision></link>
+  <link name="fixed_finger"><collision><origin xyz="0 0 0"/><geometry><box size="0.02 0.01 0.06"/>
+    </geometry></collision>
     </link>
-  <link name="jaw"><collision><origin xyz="0 0.005 0"/><geometry><box size="0.02 0.01 0.06"/></geometry></collision></link>
-  <joint name="j1" type="revolute"><parent link="base"/><child link="turret"/><origin xyz="0 0 0.1"/><axis xyz="0 0 1"/>
+  <link name="jaw"><collision><origin xyz="0 0.005 0"/><geometry><box size="0.02 0.01 0.06"/>
+    </geometry></collision></link>
+  <joint name="j1" type="revolute"><parent link="base"/><child link="turret"/>
+    <origin xyz="0 0 0.1"/><axis xyz="0 0 1"/>
     <limit lower="-3" upper="3" effort="1" velocity="2"/></joint>
   <joint name="j2" type="revolute"><parent link="turret"/><child link="upper"/><origin xyz="0 0 0.15"/>
     <axis xyz="0 1 0"/><limit lower="-2" upper="2.2" effort="1" velocity="2"/></joint>
-  <joint name="j3" type="revolute"><parent link="upper"/><child link="fore"/><origin xyz="0 0 0.42"/><axis xyz="0 1 0"/>
+  <joint name="j3" type="revolute"><parent link="upper"/><child link="fore"/>
+    <origin xyz="0 0 0.42"/><axis xyz="0 1 0"/>
     <limit lower="-2.7" upper="2.7" effort="1" velocity="2"/></joint>
-  <joint name="j4" type="revolute"><parent link="fore"/><child link="wrist"/><origin xyz="0 0 0.3"/><axis xyz="0 0 1"/>
+  <joint name="j4" type="revolute"><parent link="fore"/><child link="wrist"/>
+    <origin xyz="0 0 0.3"/><axis xyz="0 0 1"/>
     <limit lower="-3" upper="3" effort="1" velocity="2"/></joint>
   <joint name="j5" type="revolute"><parent link="wrist"/><child link="knuckle"/><origin xyz="0 0 0.12"/>
     <axis xyz="0 1 0"/><limit lower="-2.4" upper="2.4" effort="1" velocity="2"/></joint>
@@ -515,7 +524,8 @@ _SIX = """
     <limit lower="-3.1" upper="3.1" effort="1" velocity="2"/></joint>
   <joint name="left" type="prismatic"><parent link="palm"/><child link="fixed_finger"/><origin xyz="0 -0.005 0.14"/>
     <axis xyz="0 -1 0"/><limit lower="0" upper="0.04" effort="1" velocity="1"/></joint>
-  <joint name="right" type="prismatic"><parent link="palm"/><child link="jaw"/><origin xyz="0 0 0.14"/><axis xyz="0 1 0"/>
+  <joint name="right" type="prismatic"><parent link="palm"/><child link="jaw"/>
+    <origin xyz="0 0 0.14"/><axis xyz="0 1 0"/>
     <limit lower="0" upper="0.04" effort="1" velocity="1"/></joint>
 </robot>
 """
@@ -539,7 +549,9 @@ def six_joints(folder: Path, gripper: bool = True) -> RobotModel:
 
 
 def test_an_arm_of_six_joints(tmp_path: Path) -> None:
-    data = scene(objects=[cube("red", -0.1, 0.25)], goal=[{"object": "red", "at": pose(-0.1, -0.2, 0.025, 40), "on": "table"}])
+    data = scene(
+        objects=[cube("red", -0.1, 0.25)], goal=[{"object": "red", "at": pose(-0.1, -0.2, 0.025, 40), "on": "table"}]
+    )
     problem = problem_from_dict(data)
     model = six_joints(tmp_path)
     home = np.array(model.home)
@@ -569,7 +581,7 @@ def test_a_robot_without_gripper_moves_but_does_not_grasp(tmp_path: Path) -> Non
 
 
 def test_simultaneous_transitions_never_break_a_plan() -> None:
-    """With nothing but exploration every active set is drawn, also those in which one robot stacks on what another takes."""
+    """With exploration alone every active set is drawn, also one robot stacking on what another takes."""
     objects = [cube("low", 0, 0.15), cube("high", 0, -0.15)]
     goal = [{"object": "high", "on": "low"}, {"object": "low", "at": pose(0, 0, 0.025), "on": "table"}]
     problem = problem_from_dict(scene(robots=[LEFT, RIGHT], supports=[FLOOR], objects=objects, goal=goal))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import networkx as nx
 import numpy as np
 import pytest
 
 from mrtamp.collision import RESOLUTION, Counts, RobotWorld
 from mrtamp.problem import Problem, Robot
-from mrtamp.robot_file import load_robot_model
 from mrtamp.roadmap import Roadmap, lazy_path
+from mrtamp.robot_file import load_robot_model
 from mrtamp.scene import RigidTransform
 
 
@@ -17,7 +19,9 @@ from mrtamp.scene import RigidTransform
 def world() -> RobotWorld:
     panda = load_robot_model("panda")
     home = np.array(panda.home)
-    return RobotWorld(Problem("alone", (Robot("arm", panda, RigidTransform(), home, home),), (), (), (), ()), "arm", Counts())
+    return RobotWorld(
+        Problem("alone", (Robot("arm", panda, RigidTransform(), home, home),), (), (), (), ()), "arm", Counts()
+    )
 
 
 @pytest.fixture
@@ -54,7 +58,7 @@ def test_shortest_paths_are_dijkstras(roadmap: Roadmap) -> None:
                 assert not nx.has_path(graph, 0, int(goal))
                 continue
             assert path[0] == 0 and path[-1] == goal
-            assert all(graph.has_edge(a, b) or a == b for a, b in zip(path[:-1], path[1:], strict=True))
+            assert all(graph.has_edge(a, b) or a == b for a, b in pairwise(path))
             assert length(roadmap, path) == pytest.approx(nx.dijkstra_path_length(graph, 0, int(goal)))
 
 
@@ -116,7 +120,9 @@ def test_no_tracked_point_moves_more_than_the_resolution_between_samples(roadmap
         for _ in range(20):
             a = int(rng.integers(roadmap.n_vertices))
             chain = roadmap.world.chain
-            b = roadmap.add_vertex(np.clip(roadmap.q[a] + rng.normal(scale=scale, size=7), chain.lower, chain.upper), connect=False)
+            b = roadmap.add_vertex(
+                np.clip(roadmap.q[a] + rng.normal(scale=scale, size=7), chain.lower, chain.upper), connect=False
+            )
             spheres = roadmap.spheres(roadmap.edge(a, b)).astype(float)
             worst.append(np.linalg.norm(np.diff(spheres, axis=0), axis=2).max())
     assert max(worst) <= 1.02 * RESOLUTION, f"{max(worst) * 1e3:.1f} mm"

@@ -1,4 +1,4 @@
-"""The search tree keeps its promises under random growth: costs add up along branches, no cycles, cuts take all with them."""
+"""The search tree under random growth: costs add up along branches, no cycles, cuts take all with them."""
 
 from __future__ import annotations
 

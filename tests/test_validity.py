@@ -1,4 +1,4 @@
-"""Cached verdicts on roadmap edges agree with brute force in the full plant: alone, loaded, beside and between robots."""
+"""Cached verdicts on edges agree with brute force in the full plant: alone, loaded, beside and between robots."""
 
 from __future__ import annotations
 
@@ -191,7 +191,9 @@ def test_two_moving_robots(planner: Planner, full: FullPlant, modes: list[Mode],
             for a, b in ((one, two), (one[::-1], two)):
                 free = planner.validity.move(mode, "left", a, "right", b)
                 assert planner.validity.move(mode, "right", b, "left", a) == free
-                n = max(planner.roadmaps[r].n_samples(planner.roadmaps[r].edge(*x)) for r, x in (("left", a), ("right", b)))
+                n = max(
+                    planner.roadmaps[r].n_samples(planner.roadmaps[r].edge(*x)) for r, x in (("left", a), ("right", b))
+                )
                 qa, qb = line(planner, "left", a, n), line(planner, "right", b, n)
                 deep = max(full.depth(mode, {"left": x, "right": y}, "pair") for x, y in zip(qa, qb, strict=True))
                 assert not (free and deep > 0), f"free, but {deep} deep"
@@ -211,7 +213,10 @@ def test_direction_of_travel_matters_only_to_pairs_that_go_opposite_ways(planner
 
 def test_blocked_lists_what_is_known_to_be_blocked(planner: Planner, modes: list[Mode]) -> None:
     roadmap = planner.roadmaps["left"]
-    asked = {roadmap.edge(*p): planner.validity.edge("left", roadmap.edge(*p), modes[1]) for p in edges(planner, "left", 15, 70)}
+    asked = {
+        roadmap.edge(*p): planner.validity.edge("left", roadmap.edge(*p), modes[1])
+        for p in edges(planner, "left", 15, 70)
+    }
     mask = planner.validity.blocked("left", modes[1], {})
     assert len(mask) == roadmap.n_edges
     assert all(mask[e] == (not free) for e, free in asked.items())
@@ -234,9 +239,11 @@ def test_what_the_judge_forbids_stays_forbidden(planner: Planner, modes: list[Mo
 def test_a_step_forbidden_because_of_an_object_is_free_again_once_the_object_is_gone(
     planner: Planner, modes: list[Mode]
 ) -> None:
-    """The judge blames one robot when it meets a resting object; that says nothing about modes without the object there."""
+    """The judge blames one robot when it meets a resting object; modes without the object there are another matter."""
     roadmap = planner.roadmaps["right"]
-    found = next(p for p in edges(planner, "right", 40, seed=90) if planner.validity.edge("right", roadmap.edge(*p), modes[0]))
+    found = next(
+        p for p in edges(planner, "right", 40, seed=90) if planner.validity.edge("right", roadmap.edge(*p), modes[0])
+    )
     a, b = ({"left": 0, "right": v} for v in found)
     planner.validity.forbid(modes[0], a, b, ("right",))
     assert not planner.validity.edge("right", roadmap.edge(*found), modes[0])

@@ -66,15 +66,15 @@ class ModalGuidance:
 
     def edge_cost(self, choice: Choice) -> float:
         """Optimistic cost of one transition: one, and what failed attempts and reach say against it."""
-        outcome = self.sampler.outcomes.get(choice.key)
-        if outcome is None or outcome.calls == 0:
-            return 1.0 + self._prior(choice)
-        if outcome.accepted:
+        known = (self.sampler.outcomes.get(choice.key), self.sampler.foreseen.get(choice.key))
+        seen = [o for o in known if o is not None and o.calls]
+        if any(o.accepted for o in seen):
             return 1.0
-        if outcome.ik_solved:
+        calls = sum(o.calls for o in seen)
+        if any(o.ik_solved for o in seen):
             # Reachable, but in the way of something so far: that may depend on the grasp.
-            return 1.0 + min(SOFT_FAILURE * outcome.calls, FAILED_CALL)
-        return 1.0 + FAILED_CALL * outcome.calls + self._prior(choice)
+            return 1.0 + min(SOFT_FAILURE * calls, FAILED_CALL)
+        return 1.0 + FAILED_CALL * calls + self._prior(choice)
 
     def _prior(self, choice: Choice) -> float:
         if choice.kind == "handover":
@@ -104,10 +104,11 @@ class ModalGuidance:
 
     def costs_to_goal(self, item: str) -> dict[str, float]:
         """Optimistic number of transitions from every place of an object to its goal."""
-        version = sum(o.calls for k, o in self.sampler.outcomes.items() if k[2] == item)
-        known = self._costs.get(item)
-        if known is not None and known[0] == version:
-            return known[1]
+        known = (self.sampler.outcomes, self.sampler.foreseen)
+        version = sum(o.calls + bool(o.accepted) for table in known for k, o in table.items() if k[2] == item)
+        cached = self._costs.get(item)
+        if cached is not None and cached[0] == version:
+            return cached[1]
         graph = nx.DiGraph()
         for choice in self._choices(item):
             start, end = _ends(choice)
@@ -260,7 +261,7 @@ class ModalGuidance:
                 if name in c.robots
                 and set(c.robots) <= set(members)
                 and not used & set(c.robots)
-                and all(c.object != o.object for o in out)
+                and not any(self._touched(mode, c) & self._touched(mode, o) for o in out)
             ]
             if not options:
                 return []
@@ -268,6 +269,11 @@ class ModalGuidance:
             out.append(choice)
             used |= set(choice.robots)
         return out
+
+    def _touched(self, mode: Mode, choice: Choice) -> set[str]:
+        """Objects that a transition is about: what it moves, and what that is put on."""
+        body = self.problem.support(choice.place).body if choice.kind == "place" else choice.object
+        return {choice.object, body} & set(mode.of)
 
 
 def _ends(choice: Choice) -> tuple[str, str]:

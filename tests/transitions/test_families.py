@@ -1,4 +1,4 @@
-"""Grasp and placement families: closed-form dimensions, charts that invert, residuals that vanish there and only there."""
+"""Grasp and placement families: closed-form dimensions, charts that invert, residuals that vanish only there."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_the_residual_vanishes_only_on_members(family: Family, rank: int) -> Non
 
 @pytest.mark.parametrize("shape", [BOX, ROD, Shape("sphere", (0.03,)), Shape("capsule", (0.02, 0.1))])
 def test_fingers_close_on_opposite_points_of_the_surface(shape: Shape) -> None:
-    """The closing axis crosses the object's surface at half the width on both sides; the approach is one of those asked."""
+    """The closing axis crosses the surface at half the width on both sides; the approach is one of those asked."""
     asked = ("-z", "+z", "+x", "-y")
     families = grasps_of(shape, antipodal(*asked))
     assert {f.name for f in families} == {f.name for f in families} and families

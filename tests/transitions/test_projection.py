@@ -81,7 +81,7 @@ def test_a_seed_that_is_a_solution_is_returned_as_it_is(tool: Tool) -> None:
 
 def test_unreachable_targets_are_not_solved(tool: Tool) -> None:
     R, p = reachable(tool, 50)
-    q, solved = solve_ik(tool, R, p + [3.0, 0, 0], uniform_configurations(tool, np.random.default_rng(5), 50))
+    q, solved = solve_ik(tool, R, p + np.array([3.0, 0, 0]), uniform_configurations(tool, np.random.default_rng(5), 50))
     assert not solved.any()
     assert np.isfinite(q).all()
     assert np.all(q >= tool.chain.lower) and np.all(q <= tool.chain.upper)

@@ -35,8 +35,16 @@ def problem() -> dict[str, Any]:
         ],
         "supports": [{"name": "region", "on": "table", "X_BS": pose(-0.05, -0.25, 0.05), "size": [0.2, 0.2]}],
         "objects": [
-            {"name": "cube", "shape": {"box": [0.05] * 3}, "start": {"on": "pedestal", "X_WO": pose(-0.05, 0.2, 0.425)}},
-            {"name": "bar", "shape": {"box": [0.2, 0.04, 0.04]}, "start": {"on": "table", "X_WO": pose(0, -0.05, 0.02)}},
+            {
+                "name": "cube",
+                "shape": {"box": [0.05] * 3},
+                "start": {"on": "pedestal", "X_WO": pose(-0.05, 0.2, 0.425)},
+            },
+            {
+                "name": "bar",
+                "shape": {"box": [0.2, 0.04, 0.04]},
+                "start": {"on": "table", "X_WO": pose(0, -0.05, 0.02)},
+            },
         ],
         "goal": [{"object": "cube", "in": "region"}],
     }
@@ -96,7 +104,9 @@ def test_every_grasp_family_that_is_free_somewhere_is_drawn(planner: Planner) ->
     assert len(free) >= 8
     seen: set[int] = set()
     for _ in range(120):
-        seen |= {family_of([s.family for s in strata], c.after) for c in planner.sampler.sample_pick(start, "left", "cube")}
+        seen |= {
+            family_of([s.family for s in strata], c.after) for c in planner.sampler.sample_pick(start, "left", "cube")
+        }
         if free <= seen:
             break
     assert free <= seen, [strata[k].family.name for k in free - seen]
@@ -105,32 +115,32 @@ def test_every_grasp_family_that_is_free_somewhere_is_drawn(planner: Planner) ->
 def test_grasps_are_spread_over_their_family(planner: Planner) -> None:
     families = list(planner.sampler.families["left", "cube"])
     shares = []
-    for c in picked(planner, "left", "cube", 200):
+    for c in picked(planner, "left", "cube", 150):
         f = families[family_of(families, c.after)]
         x = f.coordinates(inverse(c.after.X_PO)[None])[0]
         shares.append((x - f.lower) / (f.upper - f.lower))
     counts = np.histogramdd(np.array(shares), bins=3, range=[(0, 1)] * 2)[0]
-    assert counts.min() >= 5
+    assert counts.min() >= 4
 
 
 def test_every_quadrant_and_orientation_of_a_region_is_drawn(planner: Planner) -> None:
     mode = holding(planner, "left", "cube", from_above=True)
     X_BS = planner.problem.support("region").X_BS.GetAsMatrix4()
-    found = [c.after.X_PO for _ in range(80) for c in planner.sampler.sample_place(mode, "left", "region")]
+    found = [c.after.X_PO for _ in range(60) for c in planner.sampler.sample_place(mode, "left", "region")]
     X_SO = inverse(X_BS) @ np.array(found)
     assert np.abs(X_SO[:, :2, 3]).max() <= 0.1
     np.testing.assert_allclose(X_SO[:, 2, 3], 0.025, atol=1e-9)
     quadrants = np.histogram2d(X_SO[:, 0, 3], X_SO[:, 1, 3], bins=2, range=[(-0.1, 0.1)] * 2)[0]
-    assert quadrants.min() >= 5
+    assert quadrants.min() >= 4
     turns = np.histogram(np.arctan2(X_SO[:, 1, 0], X_SO[:, 0, 0]), bins=4, range=(-np.pi, np.pi))[0]
-    assert turns.min() >= 5
+    assert turns.min() >= 4
 
 
 def test_handovers_use_many_grasps_of_the_receiver(planner: Planner) -> None:
     mode = holding(planner, "left", "bar")
     families = list(planner.sampler.families["right", "bar"])
-    found = [c for _ in range(40) for c in planner.sampler.sample_handover(mode, "left", "right")]
-    assert len(found) >= 20
+    found = [c for _ in range(20) for c in planner.sampler.sample_handover(mode, "left", "right")]
+    assert len(found) >= 10
     assert len({family_of(families, c.after) for c in found}) >= 5
     tools = {r: planner.roadmaps[r].world.tool for r in ("left", "right")}
     for c in found:
@@ -138,9 +148,15 @@ def test_handovers_use_many_grasps_of_the_receiver(planner: Planner) -> None:
         np.testing.assert_allclose(X["left"] @ c.before.X_PO, X["right"] @ c.after.X_PO, atol=1e-6)
 
 
-def full_plant_depth(planner: Planner, world: JudgeScene, q: dict[str, np.ndarray], mode: Mode) -> float:
-    """Deepest penetration (m) of robots in the full plant, what a hand holds and its gripper aside, contacts aside."""
+def full_plant_depth(
+    planner: Planner, world: JudgeScene, q: dict[str, np.ndarray], mode: Mode, resting: bool = True
+) -> float:
+    """Deepest penetration (m) of robots in the full plant, what a hand holds and its gripper aside, contacts aside.
+
+    `resting`: whether resting objects count.
+    """
     held = mode.held
+    held_names = {a.object for a in held.values()}
     z = np.empty((1, len(world.columns)))
     for name, in_scene in world.scene.robots.items():
         z[0, world.arm[name]] = q.get(name, planner.problem.robot(name).home)
@@ -153,6 +169,8 @@ def full_plant_depth(planner: Planner, world: JudgeScene, q: dict[str, np.ndarra
     worst = 0.0
     for pair in world.query(world.positions(z, poses)[0]).ComputePointPairPenetration():
         a, b = (world.solids[world.index[g]].side for g in (pair.id_A, pair.id_B))
+        if not resting and any(s.kind == "object" and s.owner not in held_names for s in (a, b)):
+            continue
         if not {a.owner, b.owner} & (set(q) | {x.object for x in held.values()}):
             continue
         carried = {x.object: r for r, x in held.items()}
@@ -181,7 +199,8 @@ def test_what_is_accepted_is_free_before_and_after(planner: Planner) -> None:
         for m in (before, before.replace(c.after)):
             if any(r in m.held for r in others):
                 continue
-            assert full_plant_depth(planner, world, q, m) == 0.0, c
+            # A handover is known for all modes: what rests near it is looked at when it is to happen.
+            assert full_plant_depth(planner, world, q, m, resting=c.kind != "handover") == 0.0, c
 
 
 def test_candidates_are_kept_and_a_pick_is_a_place_backwards(planner: Planner) -> None:
@@ -221,7 +240,14 @@ def test_everything_that_can_be_reached_counts_as_in_reach(planner: Planner) -> 
 
 def test_robots_too_small_for_the_object_say_so() -> None:
     data = problem()
-    data["objects"].append({"name": "block", "shape": {"box": [0.2] * 3}, "grasps": [], "start": {"on": "table", "X_WO": pose(0, 0.4, 0.1)}})
+    data["objects"].append(
+        {
+            "name": "block",
+            "shape": {"box": [0.2] * 3},
+            "grasps": [],
+            "start": {"on": "table", "X_WO": pose(0, 0.4, 0.1)},
+        }
+    )
     planner = Planner(problem_from_dict(data), options=Options(initial_vertices=2))
     assert planner.sampler.sample_pick(planner.root.mode, "left", "block") == []
     assert planner.sampler.outcomes["pick", ("left",), "block", "start of block"].accepted == 0

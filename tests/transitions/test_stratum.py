@@ -142,7 +142,7 @@ def test_the_jacobian_has_that_rank_at_every_sample(case: Case) -> None:
 
 def test_the_jacobian_is_a_finite_difference_of_h(case: Case) -> None:
     """Forward differences of another step, one configuration and one joint at a time."""
-    stratum, rank, dofs, q = case
+    stratum, _, dofs, q = case
     J = stratum.jacobian(q[:5])
     for i, row in enumerate(q[:5]):
         for k in range(dofs):

@@ -26,6 +26,7 @@ from mrtamp.validity import Validity
 
 _SEEDS = 3
 """IK seeds per meeting place of a handover."""
+_OUTSIDE = 0.02
 _ROOMY = 0.85
 """Share of the largest room seen for a second hand that a promising grasp leaves."""
 _NO_WAY_ON = 50.0
@@ -241,6 +242,8 @@ class TransitionSampler(Workspace):
         )
         centre, radius = self.reach[robot]
         near = np.linalg.norm(targets[:, :3, 3] - centre, axis=1) <= radius
+        # The ball was seen, not proved: a few targets outside are tried all the same.
+        near |= self.rng.random(n) < _OUTSIDE
         stats.samples += n
         if not near.any():
             stats.collisions["out of reach"] += 1

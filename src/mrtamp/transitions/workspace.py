@@ -28,6 +28,7 @@ class Workspace:
     reach : robot -> centre (3,) and radius (m) of a ball that holds every grasp point seen in random configurations.
     goal_supports : object -> supports on which it satisfies its goal.
     outcomes : what became of all samples, per stratum.
+    foreseen : what looking ahead at strata showed, without what may stand in the way there.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class Workspace:
         self.validity = validity
         self.rng = rng
         self.outcomes: dict[StratumKey, Outcome] = {}
+        self.foreseen: dict[StratumKey, Outcome] = {}
         self._grasps: dict[tuple[str, str, int], Attachment] = {}
         self.families: dict[tuple[str, str], list[GraspFamily]] = {}
         self.maps: dict[str, ReachabilityMap] = {}
@@ -63,6 +65,10 @@ class Workspace:
     def outcome(self, key: StratumKey) -> Outcome:
         """Statistics of a stratum."""
         return self.outcomes.setdefault(key, Outcome())
+
+    def foresight(self, key: StratumKey) -> Outcome:
+        """Statistics of looking ahead at a stratum."""
+        return self.foreseen.setdefault(key, Outcome())
 
     def in_reach(self, robot: str, p: np.ndarray) -> bool:
         """Whether a point lies inside the ball that the robot's grasp point was seen to reach."""
@@ -133,9 +139,8 @@ class Workspace:
                 places.append((support, below, self.body_pose(mode, body) @ f.pose(c)))
         if not places:
             return reward
-        # What is found out here about the places is what sampling them would have found out.
         for name in dict.fromkeys(support.name for support, _, _ in places):
-            self.outcome(("place", (robot,), item, name)).calls += 1
+            self.foresight(("place", (robot,), item, name)).calls += 1
         if not any(self.in_reach(robot, X[0, :3, 3]) for _, _, X in places):
             return reward
         which = self.rng.integers(len(places), size=len(grasps)).tolist()
@@ -147,7 +152,7 @@ class Workspace:
         found, solved = self.ik(robot, X_WG, seeds + self.rng.normal(scale=0.3, size=q.shape))
         for i in np.flatnonzero(solved).tolist():
             support, below, _ = places[which[i]]
-            stats = self.outcome(("place", (robot,), item, support.name))
+            stats = self.foresight(("place", (robot,), item, support.name))
             stats.ik_solved += 1
             rows = world.rows(found[i][None], grasps[i], below)
             if world.first_hit(rows, support.body, world.slot_of[item]) < 0:
