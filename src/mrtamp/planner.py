@@ -489,18 +489,21 @@ class Planner:
                     self.tree.cut(after)
             if step + 1 < len(group):
                 before, after = group[step], group[step + 1]
-                guilty = self._guilty(violation, before)
+                guilty, obstacle = self._guilty(violation, before)
                 one, two = (dict(zip(self.names, x.at, strict=True)) for x in (before, after))
-                self.validity.forbid(before.mode, one, two, guilty)
+                self.validity.forbid(before.mode, one, two, guilty, obstacle)
                 if after.alive:
                     self.tree.cut(after)
 
-    def _guilty(self, violation: Violation, node: Node) -> tuple[str, ...]:
-        """The one or two robots that a violation is about, loads counted with their carriers."""
+    def _guilty(self, violation: Violation, node: Node) -> tuple[tuple[str, ...], str | None]:
+        """The one or two robots that a violation is about, counting loads with their carriers, and what one hit."""
         carriers = {a.object: r for r, a in node.mode.held.items()}
         owners = [carriers.get(s.owner, s.owner) for s in violation.sides or ()]
         robots = tuple(dict.fromkeys(o for o in owners if o in self.roadmaps))
-        return robots or tuple(self.names[:1])
+        obstacles = [o for o in owners if o not in self.roadmaps]
+        if robots and violation.kind == "collision":
+            return robots, obstacles[0] if obstacles else robots[0]
+        return robots or tuple(self.names[:1]), None
 
     # -- reports --------------------------------------------------------------------------------------------------
 

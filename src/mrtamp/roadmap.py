@@ -164,8 +164,10 @@ def samples_between(world: RobotWorld, points: np.ndarray, a: np.ndarray, b: np.
     tracked = world.bounds.spheres(q)
     R, p = world.tool.pose(q)
     hand = p[:, None] + np.einsum("nij,kj->nki", R, points)
-    travel = [np.linalg.norm(np.diff(x, axis=0), axis=2).sum(axis=0).max() for x in (tracked, hand)]
-    return max(2, int(np.ceil(max(travel) / RESOLUTION)) + 1)
+    # The fastest coarse part decides: points do not move evenly.
+    parts = np.concatenate([np.linalg.norm(np.diff(x, axis=0), axis=2) for x in (tracked, hand)], axis=1)
+    fastest = 1.1 * float(parts.max()) * (_COARSE - 1)
+    return max(2, int(np.ceil(fastest / RESOLUTION)) + 1)
 
 
 def lazy_path(

@@ -58,6 +58,7 @@ class Validity:
         self.X_WB = {WORLD: np.eye(4), **{s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}}
         self._labels: dict[Hashable, Label] = {}
         self._moves: dict[Hashable, bool] = {}
+        self._forbidden: dict[tuple[str, tuple[Attachment, ...]], set[int]] = {}
         self._poses: dict[tuple[Attachment, ...], np.ndarray] = {}
         self._resting: dict[tuple[Attachment, ...], tuple[Resting, ...]] = {}
         self.blame: Counter[tuple[str, str]] = Counter()
@@ -100,6 +101,7 @@ class Validity:
             found = self._labels.get(key)
             if found is not None and found.hit:
                 mask[list(found.hit)] = True
+        mask[list(self._forbidden.get((robot, mode.attachments), ()))] = True
         return mask
 
     def edge(self, robot: str, e: int, mode: Mode) -> bool:
@@ -107,7 +109,7 @@ class Validity:
         held = mode.held.get(robot)
         static = self.label((robot, held, None))
         verdict = static.get(e)
-        if verdict is False:
+        if verdict is False or e in self._forbidden.get((robot, mode.attachments), ()):
             return False
         unknown: list[tuple[Resting, Label]] = []
         for item in self.resting(mode):
@@ -255,12 +257,27 @@ class Validity:
                     return other
         return None
 
-    def forbid(self, mode: Mode, a: Mapping[str, int], b: Mapping[str, int], guilty: tuple[str, ...]) -> None:
-        """Record that the step from vertices a to b collides after all; `guilty` names one robot or two."""
+    def forbid(
+        self,
+        mode: Mode,
+        a: Mapping[str, int],
+        b: Mapping[str, int],
+        guilty: tuple[str, ...],
+        obstacle: str | None = None,
+    ) -> None:
+        """Record that the step from vertices a to b collides after all.
+
+        `guilty` names one robot or two; `obstacle` what a single one hits: a resting object, or else the static world
+        or itself.  Without it the verdict holds for this very mode only.
+        """
         edges = {r: self.roadmaps[r].edge(a[r], b[r]) for r in guilty}
         if len(guilty) == 1:
             [robot] = guilty
-            self.label((robot, mode.held.get(robot), None)).put(edges[robot], False)
+            chains = {r.name: r.chain for r in self.resting(mode)}
+            if obstacle is None:
+                self._forbidden.setdefault((robot, mode.attachments), set()).add(edges[robot])
+            else:
+                self.label((robot, mode.held.get(robot), chains.get(obstacle))).put(edges[robot], False)
             return
         one, two = sorted(guilty)
         moving = [r for r in (one, two) if a[r] != b[r]]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from mrtamp.modes import Attachment
 from mrtamp.plan import Action
@@ -46,6 +48,7 @@ StratumKey = tuple[str, tuple[str, ...], str, str]
 class Outcome:
     """What became of the samples of one stratum.
 
+    `tries` and `fits` count samples per family, and those that IK and the first collision check let through.
     `blockers` are the resting objects, where they rested, that stood in the way of the last call if it yielded nothing.
     """
 
@@ -55,3 +58,10 @@ class Outcome:
     accepted: int = 0
     collisions: Counter[str] = field(default_factory=Counter)
     blockers: set[Attachment] = field(default_factory=set)
+    tries: Counter[str] = field(default_factory=Counter)
+    fits: Counter[str] = field(default_factory=Counter)
+
+    def weights(self, families: Sequence[str], floor: float = 0.3) -> np.ndarray:
+        """Probabilities (F,) of the families: by how often their samples fitted, and a floor shared by all."""
+        rate = np.array([(self.fits[f] + 1) / (self.tries[f] + 2) for f in families])
+        return (1 - floor) * rate / rate.sum() + floor / len(families)

@@ -13,7 +13,7 @@ from mrtamp.transitions.workspace import Workspace
 
 APPROACH = (0.07, 0.15, 0.25)
 """Distances (m) of the approach vertices from a contact vertex, along the hand's approach direction."""
-LIFT = (0.04, 0.12, 0.22)
+LIFT = (0.015, 0.08, 0.2)
 """Distances (m) of the lift vertices along the support's normal, where the hand does not come from there."""
 _CHAIN_JUMP = 1.0
 """Largest change (rad) of a joint between neighbours of a chain: more would be another arm posture."""

@@ -26,6 +26,9 @@ from mrtamp.validity import Validity
 
 _SEEDS = 3
 """IK seeds per meeting place of a handover."""
+_ROUNDS = 3
+_ENOUGH = 8
+"""Grasps that fit around the object which are enough to choose from; fewer call for another round of samples."""
 _OUTSIDE = 0.02
 _ROOMY = 0.85
 """Share of the largest room seen for a second hand that a promising grasp leaves."""
@@ -51,6 +54,7 @@ class TransitionSampler(Workspace):
         self._places: dict[tuple[str, Attachment], list[Candidate]] = {}
         self._handovers: dict[tuple[Attachment, str], list[Candidate]] = {}
         self._fixed: dict[tuple[str, str], Attachment] = {}
+        self._roomiest: dict[tuple[str, str], float] = {}
 
     # -- strata ---------------------------------------------------------------------------------------------------
 
@@ -103,16 +107,23 @@ class TransitionSampler(Workspace):
             stats.collisions["gripper too small"] += 1
             return []
         before = dict(stats.collisions)
-        drawn = self._draw(robot, strata, n, stats)
-        if drawn is None:
-            return []
-        q, family, c, _ = drawn
-        fits = np.flatnonzero(self.contacts.open_hand_fits(mode, robot, item, q, stats))
-        if not len(fits):
+        parts, grasps = [], []
+        for _ in range(_ROUNDS):
+            drawn = self._draw(robot, strata, n, stats)
+            if drawn is None:
+                break
+            q, family, c = drawn
+            for k in np.flatnonzero(self.contacts.open_hand_fits(mode, robot, item, q, stats)).tolist():
+                f = int(family[k])
+                stats.fits[strata[f].family.name] += 1
+                parts.append(q[k])
+                grasps.append(self.grasp(robot, item, self.families[robot, item][f], f, c[k]))
+            if len(grasps) >= _ENOUGH:
+                break
+        if not grasps:
             self._note_blockers(mode, stats, before, False)
             return []
-        q = q[fits]
-        grasps = [self.grasp(robot, item, strata[family[i]].family, int(family[i]), c[i]) for i in fits.tolist()]
+        q = np.array(parts)
         reward = self.look_ahead(mode, robot, item, grasps, q)
         near = np.linalg.norm(q - self.roadmaps[robot].world.home, axis=1)
         promising = np.isfinite(reward) if self.goal_supports[item] else np.ones(len(reward), dtype=bool)
@@ -122,7 +133,8 @@ class TransitionSampler(Workspace):
                 if other != robot:
                     self.meetings.grow_pool(mode, other, item)
             room = self.meetings.room(item, robot, grasps)
-            promising = room >= _ROOMY * room.max()
+            self._roomiest[robot, item] = max(self._roomiest.get((robot, item), 0.0), float(room.max()))
+            promising = room >= _ROOMY * self._roomiest[robot, item]
             near = near - 30.0 * room
         order = self._mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON))
         out: list[Candidate] = []
@@ -155,7 +167,7 @@ class TransitionSampler(Workspace):
         drawn = self._draw(robot, strata, n, stats)
         if drawn is None:
             return []
-        q, family, c, _ = drawn
+        q, family, c = drawn
         base = mode.chain(body) if on_object else ()
         order = self._mixed_order(np.linalg.norm(q - self.roadmaps[robot].world.home, axis=1))
         out: list[Candidate] = []
@@ -233,9 +245,11 @@ class TransitionSampler(Workspace):
 
     def _draw(
         self, robot: str, strata: Sequence[Stratum], n: int, stats: Outcome
-    ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray] | None:
-        """n samples over `strata` with constant base: solved configurations, stratum index, choices, targets."""
-        family = self.rng.integers(len(strata), size=n)
+    ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]] | None:
+        """n samples over `strata` with constant base: solved configurations, stratum index, choices."""
+        names = [s.family.name for s in strata]
+        family = self.rng.choice(len(strata), size=n, p=stats.weights(names))
+        stats.tries.update(names[f] for f in family)
         choices = [strata[f].draw_choices(self.rng, 1)[0] for f in family]
         targets = np.concatenate(
             [strata[f].targets(strata[f].base, c[None]) for f, c in zip(family, choices, strict=True)]
@@ -255,7 +269,7 @@ class TransitionSampler(Workspace):
         if not solved.any():
             return None
         rows = np.flatnonzero(solved)
-        return q[rows], family[rows], [choices[i] for i in rows], targets[rows]
+        return q[rows], family[rows], [choices[i] for i in rows]
 
     def _mixed_order(self, score: np.ndarray) -> np.ndarray:
         """Mostly the lowest scores first, every third one drawn at random, so that no sample is excluded."""
