@@ -24,6 +24,9 @@ SOFT_FAILURE = 0.3
 """The same for a call in which IK succeeded; at most FAILED_CALL in all."""
 FAILED_TRY = 0.7
 """What a failure of a transition in one mode adds to it there."""
+FAILED_STATE = 0.35
+"""The same in all modes of its modal state together; at most FAILED_STATES."""
+FAILED_STATES = 4.0
 BLOCKED = 2.0
 """What is added to acting on an object while another stands in its way."""
 UNREACHABLE = 6.0
@@ -59,7 +62,7 @@ class ModalGuidance:
             for o in problem.objects
         }
         self._costs: dict[str, tuple[int, dict[str, float]]] = {}
-        self.failures: Counter[tuple[tuple, Choice]] = Counter()
+        self._failures: Counter[tuple[tuple, Choice]] = Counter()
         self._reach_prior: dict[tuple[str, str], float] = {}
 
     # -- distances ------------------------------------------------------------------------------------------------
@@ -155,6 +158,26 @@ class ModalGuidance:
             return 4.0
         return self.costs_to_goal(item).get(a.place, 2.0 + FAILED_CALL)
 
+    # -- experience -----------------------------------------------------------------------------------------------
+
+    def failed(self, mode: Mode, choice: Choice) -> int:
+        """How often a transition came to nothing in this very mode."""
+        return self._failures[mode.attachments, choice]
+
+    def record(self, mode: Mode, choice: Choice, success: bool) -> None:
+        """Note whether acting on a choice led anywhere new, for the mode and for its modal state."""
+        if success:
+            self._failures[mode.state, choice] //= 2
+        else:
+            self._failures[mode.attachments, choice] += 1
+            self._failures[mode.state, choice] += 1
+
+    def _discouragement(self, mode: Mode, choice: Choice) -> float:
+        """What failures here, and in modes that differ only continuously, say against a choice."""
+        return FAILED_TRY * self.failed(mode, choice) + min(
+            FAILED_STATE * self._failures[mode.state, choice], FAILED_STATES
+        )
+
     # -- proposals ------------------------------------------------------------------------------------------------
 
     def enabled(self, mode: Mode) -> list[Choice]:
@@ -185,7 +208,6 @@ class ModalGuidance:
         for choice in enabled:
             item = choice.object
             start, end = _ends(choice)
-            failed = self.failures[mode.attachments, choice]
             if self.done(mode, item) and item not in blockers:
                 continue
             costs = self.costs_to_goal(item)
@@ -201,7 +223,7 @@ class ModalGuidance:
             if end in reserved and reserved[end] != item:
                 # That hand is about to take something else over.
                 detour += 3.0
-            out.append((max(detour, 0.0) + self._not_yet(mode, choice) + FAILED_TRY * failed, choice))
+            out.append((max(detour, 0.0) + self._not_yet(mode, choice) + self._discouragement(mode, choice), choice))
         out.sort(key=lambda pair: pair[0])
         return out
 

@@ -286,7 +286,7 @@ class Planner:
         mode = self.graphs.mode(orbit)
         lists = []
         for choice in choices:
-            failed = self.guidance.failures[mode.attachments, choice]
+            failed = self.guidance.failed(mode, choice)
             guided = len(choices) == 1 and failed < _PATIENCE
             known = self._known(mode, choice)
             if guided:
@@ -298,7 +298,7 @@ class Planner:
                 # What the sampler saw ahead changed the estimate: better to act on that.
                 return []
             if not known:
-                self.guidance.failures[mode.attachments, choice] += 1
+                self.guidance.record(mode, choice, success=False)
                 return []
             lists.append(known)
         if not lists:
@@ -354,9 +354,9 @@ class Planner:
                 reached = True
                 if self.best is None:
                     break
-        if candidates and not reached:
+        if candidates:
             for choice in choices:
-                self.guidance.failures[mode.attachments, choice] += 1
+                self.guidance.record(mode, choice, reached)
         if self._objects_done(mode):
             self._towards_goal(orbit)
         if self.rng.random() < self.options.persistent:
