@@ -44,6 +44,10 @@ class Graphs:
             count = self.modal.get_edge_data(source, state, {"count": 0})["count"]
             self.modal.add_edge(source, state, count=count + 1)
 
+    def visits(self, state: ModalState) -> int:
+        """How often guidance worked in a modal state."""
+        return self.modal.nodes[state]["visits"] if state in self.modal else 0
+
     def find(self, orbit: int) -> int:
         """The orbit that `orbit` has been merged into."""
         while self._parent[orbit] != orbit:

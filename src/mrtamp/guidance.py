@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import networkx as nx
 import numpy as np
 
+from mrtamp.graphs import Graphs
 from mrtamp.modes import Mode, condition_holds
 from mrtamp.problem import AtPose, HeldBy, Problem, RobotAt
 from mrtamp.transitions.candidate import StratumKey
@@ -27,6 +28,8 @@ FAILED_TRY = 0.7
 FAILED_STATE = 0.35
 """The same in all modes of its modal state together; at most FAILED_STATES."""
 FAILED_STATES = 4.0
+VISITED = 0.3
+"""Per square root of the visits to the modal state that a transition leads to: going back is no progress."""
 BLOCKED = 2.0
 """What is added to acting on an object while another stands in its way."""
 UNREACHABLE = 6.0
@@ -51,9 +54,10 @@ class Choice:
 class ModalGuidance:
     """Estimates how far modes are from the goal and proposes the transitions that lead there."""
 
-    def __init__(self, problem: Problem, sampler: TransitionSampler) -> None:
+    def __init__(self, problem: Problem, sampler: TransitionSampler, graphs: Graphs) -> None:
         self.problem = problem
         self.sampler = sampler
+        self._graphs = graphs
         self.robots = [r.name for r in problem.robots if r.model.gripper is not None]
         self._static = sampler.validity.X_WB
         self._conditions = {c.object: c for c in problem.goal if not isinstance(c, RobotAt)}
@@ -173,9 +177,14 @@ class ModalGuidance:
             self._failures[mode.state, choice] += 1
 
     def _discouragement(self, mode: Mode, choice: Choice) -> float:
-        """What failures here, and in modes that differ only continuously, say against a choice."""
-        return FAILED_TRY * self.failed(mode, choice) + min(
-            FAILED_STATE * self._failures[mode.state, choice], FAILED_STATES
+        """What speaks against a choice: failures, here and in modes alike but for poses, and where it leads."""
+        item, end = choice.object, _ends(choice)[1]
+        there = tuple((o, end if o == item else place) for o, place in mode.state)
+        visits = self._graphs.visits(there)
+        return (
+            FAILED_TRY * self.failed(mode, choice)
+            + min(FAILED_STATE * self._failures[mode.state, choice], FAILED_STATES)
+            + VISITED * float(np.sqrt(visits))
         )
 
     # -- proposals ------------------------------------------------------------------------------------------------

@@ -103,8 +103,8 @@ class Planner:
         self.names = list(self.roadmaps)
         self.validity = Validity(problem, self.collision, self.roadmaps)
         self.sampler = TransitionSampler(problem, self.collision, self.roadmaps, self.validity, self.rng)
-        self.guidance = ModalGuidance(problem, self.sampler)
         self.graphs = Graphs()
+        self.guidance = ModalGuidance(problem, self.sampler, self.graphs)
         self.tree = TensorTree(list(self.roadmaps.values()), problem.cost)
         self.steering = Steering(list(self.roadmaps.values()), self.validity, self._insert, self.rng)
         self.iteration = 0
