@@ -103,7 +103,7 @@ def test_every_grasp_family_that_is_free_somewhere_is_drawn(planner: Planner) ->
             free.add(k)
     assert len(free) >= 8
     seen: set[int] = set()
-    for _ in range(120):
+    for _ in range(400):
         seen |= {
             family_of([s.family for s in strata], c.after) for c in planner.sampler.sample_pick(start, "left", "cube")
         }
@@ -217,7 +217,9 @@ def test_outcomes_count_every_sample(planner: Planner) -> None:
     for _ in range(5):
         total += len(fresh.sampler.sample_pick(fresh.root.mode, "left", "bar", n=40))
     stats = fresh.sampler.outcomes["pick", ("left",), "bar", "start of bar"]
-    assert stats.calls == 5 and stats.samples == 200
+    # A call draws further rounds while too few grasps fit.
+    assert stats.calls == 5 and 200 <= stats.samples <= 600 and stats.samples % 40 == 0
+    assert sum(stats.tries.values()) == stats.samples
     assert stats.accepted == total > 0
     assert stats.accepted <= stats.ik_solved <= stats.samples
 
