@@ -5,7 +5,7 @@ A plan file stands alone: it carries its problem, so `mrtamp check` needs nothin
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -108,6 +108,28 @@ def plan_cost(segments: list[Segment], transitions: list[Transition], weights: C
     motion = sum(segment_cost(s, weights) for s in segments)
     changes = sum(weights.transitions.get(a.kind, 0.0) for t in transitions for a in t.actions)
     return motion + changes
+
+
+def without_detours(steps: Sequence[tuple[Action, ...]]) -> list[int]:
+    """Indices of the transitions that are left when picks put back where they came from are dropped, pair by pair.
+
+    A pick and the next action of the same robot cancel when that puts the object back to the very same attachment.
+    """
+    kept = list(range(len(steps)))
+    again = True
+    while again:
+        again = False
+        for n, i in enumerate(kept):
+            if len(steps[i]) != 1 or steps[i][0].kind != "pick":
+                continue
+            [pick] = steps[i]
+            later = (j for j in kept[n + 1 :] if any(set(a.robots) & set(pick.robots) for a in steps[j]))
+            j = next(later, None)
+            if j is not None and len(steps[j]) == 1 and steps[j][0].after is pick.before:
+                kept = [k for k in kept if k not in (i, j)]
+                again = True
+                break
+    return kept
 
 
 def measures(segments: list[Segment]) -> Mapping[str, float]:

@@ -19,7 +19,7 @@ from mrtamp.graphs import Graphs
 from mrtamp.guidance import Choice, ModalGuidance
 from mrtamp.incumbent import Incumbent
 from mrtamp.modes import Mode, objects_done, start_mode
-from mrtamp.plan import Plan, Transition
+from mrtamp.plan import Plan, Transition, without_detours
 from mrtamp.portfolio import Portfolio
 from mrtamp.problem import MrtampError, Problem, RobotAt
 from mrtamp.refine import Refiner
@@ -112,6 +112,7 @@ class Planner:
         self._goal_nodes: list[Node] = []
         self._path: list[int] = []
         self._tree_cost = np.inf
+        self._solution: Node | None = None
         self._banned: set[tuple] = set()
         self.incumbent = Incumbent(problem, seed, self.counts)
         self._portfolio = Portfolio(
@@ -165,6 +166,7 @@ class Planner:
                     yield self._incumbent()
                     if first:
                         return
+                    self._drop_detours()
                 if self.best is not None and self._refine():
                     yield self._incumbent()
         finally:
@@ -448,12 +450,40 @@ class Planner:
             if report.ok:
                 self._tree_cost = node.cost
                 self._path = [g[0].orbit for g in groups]
+                self._solution = node
                 if self.options.refinements:
                     self._portfolio.add(plan)
                 return self.incumbent.offer(plan, self._elapsed())
             self._repair(report, groups)
             if node.alive:
                 self.tree.cut(node)
+
+    def _drop_detours(self) -> None:
+        """Extend the tree by the newest solution without the picks that were put back where they came from."""
+        assert self._solution is not None
+        steps = [x for x in self.tree.branch(self._solution) if x.transition is not None]
+        kept = without_detours([x.transition.actions for x in steps if x.transition is not None])
+        if len(kept) == len(steps):
+            return
+        at = self.root
+        for k in kept:
+            transition = steps[k].transition
+            assert transition is not None
+            vertices = dict(zip(self.names, steps[k].at, strict=True))
+            combination = tuple(
+                Candidate(a.kind, a.robots, {r: vertices[r] for r in a.robots}, a.before, a.after)
+                for a in transition.actions
+            )
+            there = self.steering.drive(at, {r: v for c in combination for r, v in c.at.items()})
+            if there is None:
+                return
+            self._change_mode(there, combination)
+            after = self.tree.find(there.mode.replace(*(c.after for c in combination)), there.at)
+            if after is None:
+                return
+            at = after
+        if self._goal_vertices and self._objects_done(at.mode):
+            self._towards_goal(at.orbit)
 
     def _refine(self) -> bool:
         """A share of proposals to one of the plans under refinement; a checked gain is offered."""
