@@ -66,6 +66,7 @@ class ModalGuidance:
             for o in problem.objects
         }
         self._costs: dict[str, tuple[int, dict[str, float]]] = {}
+        self._hops: dict[str, dict[str, int]] = {}
         self._failures: Counter[tuple[tuple, Choice]] = Counter()
         self._reach_prior: dict[tuple[str, str], float] = {}
 
@@ -123,8 +124,9 @@ class ModalGuidance:
             if not graph.has_edge(end, start) or graph.edges[end, start]["weight"] > cost:
                 graph.add_edge(end, start, weight=cost)
         goals = [p for p in self.goal_places(item) if p in graph]
-        costs = nx.multi_source_dijkstra_path_length(graph, set(goals)) if goals else {}
+        costs, paths = nx.multi_source_dijkstra(graph, goals) if goals else ({}, {})
         self._costs[item] = (version, costs)
+        self._hops[item] = {place: len(path) - 1 for place, path in paths.items()}
         return costs
 
     def _choices(self, item: str) -> list[Choice]:
@@ -147,8 +149,18 @@ class ModalGuidance:
         return a.parent not in mode.of or self.done(mode, a.parent)
 
     def remaining(self, mode: Mode) -> float:
-        """Optimistic number of transitions from `mode` to a goal mode."""
+        """Optimistic cost of the transitions from `mode` to a goal mode: their number, and what failures say."""
         return sum(self._remaining(mode, item) for item in mode.of)
+
+    def transitions_to_go(self, mode: Mode) -> int:
+        """Number of transitions on the paths that `remaining` is the cost of."""
+        return sum(self._transitions_to_go(mode, item) for item in mode.of)
+
+    def _transitions_to_go(self, mode: Mode, item: str) -> int:
+        if self.done(mode, item):
+            return 0
+        estimate = self._remaining(mode, item)
+        return self._hops.get(item, {}).get(mode.of[item].place) or round(min(estimate, 4.0))
 
     def _remaining(self, mode: Mode, item: str) -> float:
         a = mode.of[item]

@@ -71,7 +71,7 @@ class Status:
     modes: int
     orbits: int
     nodes: int
-    remaining: float
+    remaining: int
     cost: float | None
 
 
@@ -208,7 +208,7 @@ class Planner:
         """Orbit to work in and the elementary transitions Gamma to sample there (one per robot, disjoint)."""
         explore = self.rng.random() < self.options.persistent
         if explore:
-            orbits = [o for o in self.graphs.orbital.nodes if self.tree.of_orbit.get(o)]
+            orbits = [o for o in self.graphs.orbital.nodes if self.tree.of_orbit.get(o)] or [0]
             orbit = orbits[int(self.rng.integers(len(orbits)))]
         elif self.best is not None:
             orbit = self._orbit_path_guidance()
@@ -539,7 +539,8 @@ class Planner:
 
     def status(self) -> Status:
         """A snapshot for progress displays."""
-        remaining = min((self.guidance.remaining(m) for m in self.modes()), default=0.0) if self.best is None else 0.0
+        nearest = min(self.modes(), key=self.guidance.remaining, default=None) if self.best is None else None
+        remaining = self.guidance.transitions_to_go(nearest) if nearest is not None else 0
         return Status(
             phase="first plan" if self.best is None else "improving",
             iteration=self.iteration,
