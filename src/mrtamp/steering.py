@@ -21,6 +21,8 @@ from mrtamp.validity import Validity
 ROUNDS = 40
 """Lazy searches per path before the oracle gives up."""
 _ASIDE = 6
+_ASIDE_ROUNDS = 8
+"""The same for a robot that only has to get out of the way: there are other places to go to."""
 
 Insert = Callable[[Node, At], Node]
 
@@ -52,15 +54,15 @@ class Steering:
             at: Node | None = node
             for robot in order:
                 assert at is not None
-                at = self._go(at, robot, targets[robot], frozenset(targets), depth)
+                at = self._go(at, robot, targets[robot], depth)
                 if at is None:
                     break
             if at is not None and all(at.at[self.index[r]] == v for r, v in targets.items()):
                 return at
         return None
 
-    def _go(self, node: Node, robot: str, goal: int, keep: frozenset[str], depth: int) -> Node | None:
-        path, blockers = self.path(node.mode, node.at, robot, goal)
+    def _go(self, node: Node, robot: str, goal: int, depth: int, rounds: int = ROUNDS) -> Node | None:
+        path, blockers = self.path(node.mode, node.at, robot, goal, rounds=rounds)
         if path is not None:
             return self._follow(node, robot, path)
         if depth <= 0 or not blockers:
@@ -93,13 +95,13 @@ class Steering:
                 continue
             if not all(self.validity.against(robot, e, node.mode, other, v) for e in edges):
                 continue
-            moved = self._go(node, other, v, frozenset(), depth)
+            moved = self._go(node, other, v, depth, _ASIDE_ROUNDS)
             if moved is not None:
                 return moved
         return None
 
     def path(
-        self, mode: Mode, at: At, robot: str, goal: int, ignore: set[str] | None = None
+        self, mode: Mode, at: At, robot: str, goal: int, ignore: set[str] | None = None, rounds: int = ROUNDS
     ) -> tuple[list[int] | None, Counter[str]]:
         """Shortest valid path of one robot while the others stand, and how often each of those was in the way."""
         roadmap = self.roadmaps[self.index[robot]]
@@ -124,7 +126,7 @@ class Steering:
             if self.validity.label((robot, mode.held.get(robot), other, v, mode.held.get(other))).hit:
                 blockers[other] += 1
         blocked = self.validity.blocked(robot, mode, standing)
-        return lazy_path(roadmap, start, goal, blocked, validate, ROUNDS), blockers
+        return lazy_path(roadmap, start, goal, blocked, validate, rounds), blockers
 
     def _follow(self, node: Node, robot: str, path: list[int]) -> Node:
         i = self.index[robot]
