@@ -57,7 +57,6 @@ class Refiner:
         self._load(segments)
         self._subdivide()
         self._measure()
-        self.start_cost = self.cost
 
     # -- representation -------------------------------------------------------------------------------------------
 

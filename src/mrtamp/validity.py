@@ -7,7 +7,6 @@ in it.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 
@@ -61,7 +60,6 @@ class Validity:
         self._forbidden: dict[tuple[str, tuple[Attachment, ...]], set[int]] = {}
         self._poses: dict[tuple[Attachment, ...], np.ndarray] = {}
         self._resting: dict[tuple[Attachment, ...], tuple[Resting, ...]] = {}
-        self.blame: Counter[tuple[str, str]] = Counter()
 
     def label(self, key: Hashable) -> Label:
         """The label of a factor."""
@@ -174,13 +172,11 @@ class Validity:
                 factor.put(e, True)
             return True
         names = {x for pair in world.culprits(rows[i], contact, slot) for x in pair}
-        guilty = [(item, factor) for item, factor in unknown if item.name in names]
-        for item, factor in guilty:
+        guilty = [factor for item, factor in unknown if item.name in names]
+        for factor in guilty:
             factor.put(e, False)
-            self.blame[robot, item.name] += 1
         if not guilty:
             static.put(e, False)
-            self.blame[robot, "static"] += 1
         return False
 
     def against(self, robot: str, e: int, mode: Mode, other: str, v: int) -> bool:
@@ -193,8 +189,6 @@ class Validity:
         stand = self.roadmaps[other].edge(v, v)
         free = self._apart(robot, e, held, other, stand, other_held, False)
         factor.put(e, free)
-        if not free:
-            self.blame[robot, other] += 1
         return free
 
     def move(self, mode: Mode, a: str, edge_a: tuple[int, int], b: str, edge_b: tuple[int, int]) -> bool:
