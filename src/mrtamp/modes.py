@@ -164,8 +164,3 @@ def condition_holds(
 def objects_done(problem: Problem, mode: Mode, X_WP: Mapping[str, np.ndarray]) -> bool:
     """Whether every object condition of the goal holds."""
     return all(condition_holds(problem, c, mode, X_WP) for c in problem.goal if not isinstance(c, RobotAt))
-
-
-def robots_done(problem: Problem, q: Mapping[str, np.ndarray]) -> bool:
-    """Whether every robot condition of the goal holds at the composite configuration q (robot -> (n,))."""
-    return all(np.max(np.abs(q[c.robot] - c.q)) <= JOINT_TOLERANCE for c in problem.goal if isinstance(c, RobotAt))

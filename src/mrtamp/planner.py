@@ -378,11 +378,12 @@ class Planner:
 
     def _towards(self, near: Node, combination: tuple[Candidate, ...]) -> bool:
         """Drive the active robots to their transition vertices and change the mode there."""
-        targets = {r: v for c in combination for r, v in c.at.items()}
-        node = self.steering.drive(near, targets)
-        if node is None:
-            return False
-        return self._change_mode(node, combination)
+        node = self._drive(near, combination)
+        return node is not None and self._change_mode(node, combination)
+
+    def _drive(self, near: Node, combination: tuple[Candidate, ...]) -> Node | None:
+        """The node at which all active robots of a transition stand at their vertices."""
+        return self.steering.drive(near, {r: v for c in combination for r, v in c.at.items()})
 
     def _change_mode(self, node: Node, combination: tuple[Candidate, ...]) -> bool:
         mode = node.mode.replace(*(c.after for c in combination))
@@ -474,7 +475,7 @@ class Planner:
                 Candidate(a.kind, a.robots, {r: vertices[r] for r in a.robots}, a.before, a.after)
                 for a in transition.actions
             )
-            there = self.steering.drive(at, {r: v for c in combination for r, v in c.at.items()})
+            there = self._drive(at, combination)
             if there is None:
                 return
             self._change_mode(there, combination)

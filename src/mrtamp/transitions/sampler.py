@@ -141,10 +141,7 @@ class TransitionSampler(Workspace):
         for i in order[: 4 * keep]:
             v = self.contacts.contact(robot, placement, chain, grasps[i], q[i], stats, mode)
             if v is not None:
-                candidate = Candidate("pick", (robot,), {robot: v}, placement, grasps[i], chain[1:], bool(promising[i]))
-                self._picks.setdefault((robot, chain), []).append(candidate)
-                back = Candidate("place", (robot,), {robot: v}, grasps[i], placement, chain[1:])
-                self._places.setdefault((robot, grasps[i]), []).append(back)
+                candidate, _ = self._register(robot, v, placement, grasps[i], chain[1:], bool(promising[i]))
                 out.append(candidate)
                 stats.accepted += 1
                 if len(out) == keep:
@@ -177,10 +174,7 @@ class TransitionSampler(Workspace):
             placement = self._placement(item, body, support, X_BO, fixed)
             v = self.contacts.contact(robot, placement, (placement, *base), grasp, q[i], stats, mode)
             if v is not None:
-                candidate = Candidate("place", (robot,), {robot: v}, grasp, placement, base)
-                self._places.setdefault((robot, grasp), []).append(candidate)
-                back = Candidate("pick", (robot,), {robot: v}, placement, grasp, base)
-                self._picks.setdefault((robot, (placement, *base)), []).append(back)
+                _, candidate = self._register(robot, v, placement, grasp, base)
                 out.append(candidate)
                 stats.accepted += 1
                 if len(out) == keep:
@@ -240,6 +234,22 @@ class TransitionSampler(Workspace):
             return
         names = [n for n, k in stats.collisions.items() if n in mode.of and k > before.get(n, 0)]
         stats.blockers = {mode.of[n] for n in names if not mode.of[n].held}
+
+    def _register(
+        self,
+        robot: str,
+        v: int,
+        placement: Attachment,
+        grasp: Attachment,
+        base: tuple[Attachment, ...],
+        promising: bool = True,
+    ) -> tuple[Candidate, Candidate]:
+        """Keep the pick and the place that one contact vertex stands for."""
+        pick = Candidate("pick", (robot,), {robot: v}, placement, grasp, base, promising)
+        place = Candidate("place", (robot,), {robot: v}, grasp, placement, base)
+        self._picks.setdefault((robot, (placement, *base)), []).append(pick)
+        self._places.setdefault((robot, grasp), []).append(place)
+        return pick, place
 
     # -- steps ----------------------------------------------------------------------------------------------------
 
