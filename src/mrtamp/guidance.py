@@ -178,14 +178,14 @@ class ModalGuidance:
 
     def failed(self, mode: Mode, choice: Choice) -> int:
         """How often a transition came to nothing in this very mode."""
-        return self._failures[mode.attachments, choice]
+        return self._failures[mode.key, choice]
 
     def record(self, mode: Mode, choice: Choice, success: bool) -> None:
         """Note whether acting on a choice led anywhere new, for the mode and for its modal state."""
         if success:
             self._failures[mode.state, choice] //= 2
         else:
-            self._failures[mode.attachments, choice] += 1
+            self._failures[mode.key, choice] += 1
             self._failures[mode.state, choice] += 1
 
     def _discouragement(self, mode: Mode, choice: Choice) -> float:

@@ -6,14 +6,18 @@ placement), so it serves as the key of every cache that depends on it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mrtamp.kinematics import inverse
 from mrtamp.problem import AtPose, HeldBy, InRegion, Problem, RobotAt
+
+if TYPE_CHECKING:
+    from mrtamp.plan import Transition
 
 POSITION_TOLERANCE = 1e-4
 """How far (m) an object may be from a goal pose."""
@@ -50,17 +54,26 @@ class Attachment:
 
 
 ModalState = tuple[tuple[str, str], ...]
-"""Object name and the name of its support or robot, sorted by object: a vertex of the modal graph."""
+"""Object name and the name of its support or robot, sorted by object, then the subgoals reached, each with `REACHED`:
+a vertex of the modal graph."""
+REACHED = "reached"
 
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """One attachment per object.  Two modes are the same when their attachments are the very same objects.
+    """One attachment per object, and the subgoals that have been reached.
 
-    `attachments` itself is the key of a mode in dictionaries.
+    Two modes are the same when their attachments are the very same objects and `done` is equal: `key` identifies a mode
+    in dictionaries.  What is free of collision depends on `attachments` alone.
     """
 
     attachments: tuple[Attachment, ...]
+    done: frozenset[str] = frozenset()
+
+    @cached_property
+    def key(self) -> tuple:
+        """What identifies the mode."""
+        return (self.attachments, tuple(sorted(self.done)))
 
     @cached_property
     def of(self) -> Mapping[str, Attachment]:
@@ -75,7 +88,10 @@ class Mode:
     @cached_property
     def state(self) -> ModalState:
         """The mode without its continuous part."""
-        return tuple(sorted((a.object, a.place) for a in self.attachments))
+        return (
+            *sorted((a.object, a.place) for a in self.attachments),
+            *((name, REACHED) for name in sorted(self.done)),
+        )
 
     @cached_property
     def loaded(self) -> frozenset[str]:
@@ -90,10 +106,15 @@ class Mode:
             a = self.of[a.parent]
         return a.parent
 
-    def replace(self, *changes: Attachment) -> Mode:
-        """The mode in which each changed object has its new attachment."""
+    def replace(self, *changes: Attachment, done: Iterable[str] = ()) -> Mode:
+        """The mode in which each changed object has its new attachment, and the subgoals `done` are reached as well."""
         new = {a.object: a for a in changes}
-        return Mode(tuple(new.get(a.object, a) for a in self.attachments))
+        return Mode(tuple(new.get(a.object, a) for a in self.attachments), self.done | frozenset(done))
+
+    def after(self, transition: Transition) -> Mode:
+        """The mode to which a transition leads."""
+        changes = [a.after for a in transition.actions if a.after is not None]
+        return self.replace(*changes, done=[a.subgoal for a in transition.actions if a.subgoal is not None])
 
     def chain(self, object_name: str) -> tuple[Attachment, ...]:
         """The attachments that fix the object's world pose: its own, its parent object's, and so on."""
@@ -161,6 +182,6 @@ def condition_holds(
     return condition.X_BO is None or _same_pose(a.X_PO, condition.X_BO.GetAsMatrix4())
 
 
-def objects_done(problem: Problem, mode: Mode, X_WP: Mapping[str, np.ndarray]) -> bool:
-    """Whether every object condition of the goal holds."""
-    return all(condition_holds(problem, c, mode, X_WP) for c in problem.goal if not isinstance(c, RobotAt))
+def goal_mode(problem: Problem, mode: Mode, X_WP: Mapping[str, np.ndarray]) -> bool:
+    """Whether every subgoal is reached and every object condition of the goal holds."""
+    return len(mode.done) == len(problem.subgoals) and all(condition_holds(problem, c, mode, X_WP) for c in problem.goal if not isinstance(c, RobotAt))

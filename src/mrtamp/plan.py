@@ -33,17 +33,22 @@ class Segment:
 
 @dataclass(frozen=True)
 class Action:
-    """One elementary change: pick, place or handover, by `robots` (receiver last), of an object's attachment."""
+    """One elementary change by `robots` (receiver last): pick, place, handover, or reach.
+
+    The first three change an object's attachment from `before` to `after`; reach reaches `subgoal`, and changes an
+    attachment where the subgoal says so.
+    """
 
     kind: str
     robots: tuple[str, ...]
-    before: Attachment
-    after: Attachment
+    before: Attachment | None
+    after: Attachment | None
+    subgoal: str | None = None
 
     @property
-    def object(self) -> str:
-        """The object whose attachment changes."""
-        return self.after.object
+    def object(self) -> str | None:
+        """The object whose attachment changes; None where none does."""
+        return self.after.object if self.after is not None else None
 
 
 @dataclass(frozen=True)

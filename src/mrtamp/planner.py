@@ -18,7 +18,7 @@ from mrtamp.explain import explain
 from mrtamp.graphs import Graphs
 from mrtamp.guidance import Choice, ModalGuidance
 from mrtamp.incumbent import Incumbent
-from mrtamp.modes import Mode, objects_done, start_mode
+from mrtamp.modes import Mode, goal_mode, start_mode
 from mrtamp.plan import Plan, Transition, without_detours
 from mrtamp.portfolio import Portfolio
 from mrtamp.problem import MrtampError, Problem, RobotAt
@@ -359,7 +359,7 @@ class Planner:
         if candidates:
             for choice in choices:
                 self.guidance.record(mode, choice, reached)
-        if self._objects_done(mode):
+        if self._goal_mode(mode):
             self._towards_goal(orbit)
         if self.rng.random() < self.options.persistent:
             node = self._select_tensor_node(orbit, uniform=True)
@@ -388,7 +388,7 @@ class Planner:
     def _change_mode(self, node: Node, combination: tuple[Candidate, ...]) -> bool:
         mode = node.mode.replace(*(c.after for c in combination))
         active = tuple(sorted({r for c in combination for r in c.robots}))
-        if (mode.attachments, node.at) in self._banned:
+        if (mode.key, node.at) in self._banned:
             return False
         if self.validity.stand(mode, dict(zip(self.names, node.at, strict=True)), active) is not None:
             return False
@@ -430,12 +430,12 @@ class Planner:
 
     # -- solutions ------------------------------------------------------------------------------------------------
 
-    def _objects_done(self, mode: Mode) -> bool:
-        return objects_done(self.problem, mode, self.validity.X_WB)
+    def _goal_mode(self, mode: Mode) -> bool:
+        return goal_mode(self.problem, mode, self.validity.X_WB)
 
     def _note_goal(self, node: Node) -> None:
         at = dict(zip(self.names, node.at, strict=True))
-        if all(at[r] == v for r, v in self._goal_vertices.items()) and self._objects_done(node.mode):
+        if all(at[r] == v for r, v in self._goal_vertices.items()) and self._goal_mode(node.mode):
             self._goal_nodes.append(node)
 
     def _best_solution(self) -> bool:
@@ -483,7 +483,7 @@ class Planner:
             if after is None:
                 return
             at = after
-        if self._goal_vertices and self._objects_done(at.mode):
+        if self._goal_vertices and self._goal_mode(at.mode):
             self._towards_goal(at.orbit)
 
     def _refine(self) -> bool:
@@ -515,7 +515,7 @@ class Planner:
             if at_end and violation.segment + 1 < len(groups):
                 # Fingers that close or open at the transition may be the cause.
                 after = groups[violation.segment + 1][0]
-                self._banned.add((after.mode.attachments, after.at))
+                self._banned.add((after.mode.key, after.at))
                 if after.alive:
                     self.tree.cut(after)
             if step + 1 < len(group):

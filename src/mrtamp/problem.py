@@ -202,6 +202,68 @@ class RobotAt:
 Condition = InRegion | AtPose | HeldBy | RobotAt
 
 
+@dataclass(frozen=True, eq=False)
+class AtConfiguration:
+    """Target of a robot in a subgoal: exactly configuration `q` (n joints, rad or m)."""
+
+    q: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class HandAt:
+    """Target of a robot in a subgoal: its grasp frame G at `X_WG`; the arm's posture is free."""
+
+    X_WG: RigidTransform
+
+
+@dataclass(frozen=True, eq=False)
+class HandIn:
+    """Target of a robot in a subgoal: the origin of its grasp frame inside a box (full sizes `size`, m) at `X_WC`."""
+
+    X_WC: RigidTransform
+    size: tuple[float, float, float]
+
+
+Target = AtConfiguration | HandAt | HandIn
+
+
+@dataclass(frozen=True)
+class Attach:
+    """What a subgoal does to an object on arrival: from there on it is fixed to `parent` where it is.
+
+    `parent` is a robot of the subgoal (it takes the object), or a static body, another object or the world (whoever
+    holds the object lets go of it).
+    """
+
+    object: str
+    parent: str
+
+
+@dataclass(frozen=True, eq=False)
+class Subgoal:
+    """Something to be visited, the `reach` transition: each robot of `targets` at its target at the same instant.
+
+    `after` names the subgoals that have to be reached earlier, or at the same instant at the earliest.
+    """
+
+    name: str
+    targets: dict[str, Target]
+    after: tuple[str, ...] = ()
+    attach: Attach | None = None
+
+
+@dataclass(frozen=True)
+class CollisionRules:
+    """What does not count as a collision.
+
+    `ignore` lists pairs of things that may overlap, each a robot ("left"), one of its bodies ("left/link7"), a static
+    body or an object.  A configuration is free when its penetrations (m) add up to no more than `tolerance`.
+    """
+
+    ignore: tuple[tuple[str, str], ...] = ()
+    tolerance: float = 0.0
+
+
 @dataclass(frozen=True)
 class CostWeights:
     """J = sum over synchronous steps of makespan * max_r |dq_r| + path_length * sum_r |dq_r|, plus transition costs."""
@@ -216,7 +278,8 @@ class Problem:
     """Everything a planner needs to know.
 
     `supports` includes those synthesised from exact poses and from goals on objects, so every place where an object may
-    rest (start, goal, intermediate) is one of them.
+    rest (start, goal, intermediate) is one of them.  Every one of `subgoals` has to be reached, and `goal` holds at the
+    end.
     """
 
     name: str
@@ -227,6 +290,8 @@ class Problem:
     goal: tuple[Condition, ...]
     cost: CostWeights = CostWeights()
     description: str = ""
+    subgoals: tuple[Subgoal, ...] = ()
+    collision: CollisionRules = CollisionRules()
     package_paths: tuple[Path, ...] = ()
     source: dict | None = None
 
@@ -241,3 +306,7 @@ class Problem:
     def support(self, name: str) -> Support:
         """The support called `name`."""
         return next(s for s in self.supports if s.name == name)
+
+    def subgoal(self, name: str) -> Subgoal:
+        """The subgoal called `name`."""
+        return next(s for s in self.subgoals if s.name == name)

@@ -58,11 +58,11 @@ class TensorTree:
 
     def find(self, mode: Mode, at: At) -> Node | None:
         """The node at these vertices in this mode."""
-        return self._find.get((mode.attachments, at))
+        return self._find.get((mode.key, at))
 
     def entry(self, mode: Mode) -> Node | None:
         """The first node by which `mode` was entered that still stands."""
-        return next((x for x in self._entries.get(mode.attachments, []) if x.alive), None)
+        return next((x for x in self._entries.get(mode.key, []) if x.alive), None)
 
     def add_root(self, mode: Mode, at: At, orbit: int) -> Node:
         """The start."""
@@ -96,10 +96,10 @@ class TensorTree:
     ) -> Node:
         node = Node(len(self.nodes), mode, at, orbit, cost, parent, transition)
         self.nodes.append(node)
-        self._find[mode.attachments, at] = node
+        self._find[mode.key, at] = node
         self.of_orbit.setdefault(orbit, []).append(node)
         if parent is None or transition is not None:
-            self._entries.setdefault(mode.attachments, []).append(node)
+            self._entries.setdefault(mode.key, []).append(node)
         if parent is not None:
             parent.children.append(node)
         return node
@@ -135,7 +135,7 @@ class TensorTree:
         while stack:
             x = stack.pop()
             x.alive = False
-            self._find.pop((x.mode.attachments, x.at), None)
+            self._find.pop((x.mode.key, x.at), None)
             self.of_orbit[x.orbit].remove(x)
             stack += x.children
 
