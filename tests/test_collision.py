@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
+from discs import HEIGHT, RADIUS, disc_problem
 from gantry import gantry_model, gantry_problem, gantry_urdf, grasp
+from pydrake.math import RigidTransform
 
 from mrtamp.collision import CONTACT_DEPTH, PADDING, Collision, Counts, bisection_order
 from mrtamp.modes import Attachment, start_mode
-from mrtamp.problem import Gripper, Problem
+from mrtamp.problem import CollisionRules, Gripper, Problem
 from mrtamp.scene import build_scene, geometry_ids
 
 
@@ -83,6 +86,96 @@ def test_a_held_object_may_touch_its_hand_and_what_it_stands_on_and_nothing_else
 def test_equal_shapes_share_a_slot(collision: Collision) -> None:
     slots = collision.worlds["left"].slot_of
     assert slots["cube"] == slots["block"] != slots["bar"]
+
+
+def ruled(problem: Problem, *ignore: tuple[str, str], tolerance: float = 0.0) -> Problem:
+    return dataclasses.replace(problem, collision=CollisionRules(ignore, tolerance))
+
+
+@pytest.mark.parametrize(
+    ("pair", "free"),
+    [
+        (("left", "wall"), [False, True]),
+        (("left/tool", "wall"), [False, True]),
+        (("left/finger_left", "wall"), [False, False]),
+        (("cube", "left"), [True, False]),
+        (("left/finger_right", "cube"), [True, False]),
+        (("right", "cube"), [False, False]),
+        (("cube", "block"), [False, False]),
+    ],
+)
+def test_pairs_that_are_ignored_may_overlap(problem: Problem, pair: tuple[str, str], free: list[bool]) -> None:
+    """The first hand has a finger (the right one) in the cube, the second its palm in the wall."""
+    world = Collision(ruled(problem, pair)).worlds["left"]
+    q = np.array([[-0.4, 0.03, 0.04, 0], [0, 0.6, 0.1, 0]])
+    np.testing.assert_array_equal(~world.hits(world.rows(q, None, resting(problem))), free)
+
+
+def test_objects_of_one_shape_share_a_slot_only_under_the_same_rules(problem: Problem) -> None:
+    """Block and cube are equal boxes; the cube may pass through the bar, which the block may not."""
+    same = Collision(ruled(problem, ("cube", "bar"), ("bar", "block"))).worlds["left"]
+    assert same.slot_of["cube"] == same.slot_of["block"]
+    world = Collision(ruled(problem, ("bar", "cube"))).worlds["left"]
+    assert world.slot_of["cube"] != world.slot_of["block"]
+    q = np.array([[-0.4, -0.3, 0.06, 0]])
+    poses = {"bar": resting(problem)["bar"]}
+    assert not world.hits(world.rows(q, grasp("cube", "left"), poses))[0]
+    assert world.hits(world.rows(q, grasp("block", "left"), poses))[0]
+
+
+def test_ignored_pairs_of_robots_and_their_loads(problem: Problem) -> None:
+    q = np.array([[0.0, 0.0, 0.3, 0.0]])
+    beside = q + np.array([0, 0.06, 0, 0])
+
+    def meet(collision: Collision, held: Attachment | None) -> bool:
+        pair, _ = collision.pair("left", "right")
+        return pair.first_hit(q, held, beside, None) == 0
+
+    apart = Collision(problem)
+    assert meet(apart, None) and meet(apart, grasp("bar", "left"))
+    through = Collision(ruled(problem, ("left", "right")))
+    assert not meet(through, None) and meet(through, grasp("bar", "left", offset=0.05))
+    both = Collision(ruled(problem, ("left", "right"), ("right", "bar")))
+    assert not meet(both, grasp("bar", "left", offset=0.05))
+
+
+def test_a_tolerance_is_for_the_sum_of_penetrations(tmp_path: Path) -> None:
+    """A disc 3 mm deep in the wall and 4 mm in the token; two discs that overlap by 4 mm."""
+    discs = disc_problem(tmp_path)
+    token = RigidTransform([-0.5, -0.247 - RADIUS - 0.05 + 0.004, HEIGHT]).GetAsMatrix4()
+    q = np.array([[-0.5, -0.247]])
+
+    def hit(tolerance: float, objects: dict[str, np.ndarray]) -> bool:
+        world = Collision(ruled(discs, tolerance=tolerance)).worlds["a"]
+        return bool(world.hits(world.rows(q, None, objects))[0])
+
+    assert [hit(t, {}) for t in (0.0, 0.0029, 0.0031)] == [True, True, False]
+    assert [hit(t, {"token": token}) for t in (0.005, 0.0069, 0.0071)] == [True, True, False]
+
+    def meet(tolerance: float, gap: float) -> bool:
+        pair, _ = Collision(ruled(discs, tolerance=tolerance)).pair("a", "b")
+        return pair.first_hit(np.array([[0.0, 0.0]]), None, np.array([[2 * RADIUS + gap, 0.0]]), None) == 0
+
+    # With a tolerance what counts is how deep the shapes are as they are, without padding.
+    assert [meet(t, -0.004) for t in (0.0, 0.0039, 0.0041)] == [True, True, False]
+
+
+def test_where_robots_stand_shapes_are_not_padded(tmp_path: Path) -> None:
+    pair, _ = Collision(disc_problem(tmp_path)).pair("a", "b")
+    gaps = np.array([0.001, -0.001, 2 * PADDING + 0.001])
+    qb = np.column_stack([2 * RADIUS + gaps, np.zeros(3)])
+    found = []
+    for k, exact in itertools.product(range(3), (False, True)):
+        found.append(pair.first_hit(np.zeros((1, 2)), None, qb[[k]], None, exact=np.array([exact])) == 0)
+    assert found == [True, False, True, True, False, False]
+
+
+def test_without_a_gripper_what_is_held_may_touch_the_body_that_holds_it(tmp_path: Path) -> None:
+    world = Collision(disc_problem(tmp_path)).worlds["b"]
+    q = np.array([[0.5, -0.5], [-0.5, 0.28]])
+    held = Attachment("token", "b", RigidTransform([0, -0.2, 0]).GetAsMatrix4())
+    np.testing.assert_array_equal(world.hits(world.rows(q, held, {})), [False, True])
+    assert {"wall", world.slot_of["token"]} == set(world.culprits(world.rows(q, held, {})[1])[0])
 
 
 def test_pairs_agree_in_both_orders(problem: Problem, collision: Collision) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from discs import disc_problem, errand
 from gantry import gantry_problem, valid_plan
 
 from mrtamp.check import check_plan
@@ -83,6 +84,39 @@ def test_the_schema_accepts_plans_and_rejects_others(data: dict[str, Any]) -> No
     assert not validator.is_valid({**data, "mrtamp_plan": 2})
 
 
+@pytest.fixture(scope="module")
+def errands(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The file of a plan that reaches subgoals: two at once, one of which takes an object, then one that drops it."""
+    plan = errand(disc_problem(tmp_path_factory.mktemp("discs")))
+    return json.loads(json.dumps(plan_to_dict(plan)))
+
+
+def test_subgoals_come_back(errands: dict[str, Any]) -> None:
+    back = plan_from_dict(errands)
+    assert [sorted(s.mode.done) for s in back.segments] == [[], ["take", "visit"], ["drop", "take", "visit"]]
+    assert [[a.subgoal for a in t.actions] for t in back.transitions] == [["visit", "take"], ["drop"]]
+    visit, take = back.transitions[0].actions
+    assert (visit.kind, visit.before, visit.after, visit.object) == ("reach", None, None, None)
+    assert take.before is back.segments[0].mode.of["token"] and take.after is back.segments[1].mode.of["token"]
+    assert plan_to_dict(back) == errands
+    assert "done" not in errands["segments"][0]
+    report = check_plan(back)
+    assert report.ok, str(report)
+
+
+def test_the_schema_knows_subgoals(errands: dict[str, Any]) -> None:
+    validator = jsonschema.Draft202012Validator(json.loads((models_dir() / "schema" / "plan.schema.json").read_text()))
+    validator.validate(errands)
+    for spoil in (
+        _drop("transitions", 0, "actions", 0, "subgoal"),
+        _set("transitions", 0, "actions", 0, "kind", "pick"),
+        _set("segments", 1, "done", ["take", "take"]),
+    ):
+        spoiled = copy.deepcopy(errands)
+        spoil(spoiled)
+        assert not validator.is_valid(spoiled)
+
+
 def _set(*path_and_value: Any) -> Callable[[dict[str, Any]], None]:
     *path, key, value = path_and_value
 
@@ -135,6 +169,35 @@ MISTAKES = {
     "history[0]: found no key 'time_s'": _drop("history", 0, "time_s"),
     "counts.nodes: found 'many'": _set("counts", "nodes", "many"),
 }
+
+
+SUBGOAL_MISTAKES = {
+    "segments[1].done[0]: found 'tke', expected one of the subgoals: visit, take, drop": _set(
+        "segments", 1, "done", ["tke"]
+    ),
+    "segments[1].done: found ['take', 'take'], expected each subgoal once": _set("segments", 1, "done", ["take"] * 2),
+    "transitions[0].actions[0]: found no key 'subgoal'": _drop("transitions", 0, "actions", 0, "subgoal"),
+    "transitions[0].actions[0].subgoal: found 'a', expected one of the subgoals": _set(
+        "transitions", 0, "actions", 0, "subgoal", "a"
+    ),
+    "transitions[0].actions[0].subgoal: found 'visit', expected none: a pick reaches": _set(
+        "transitions", 0, "actions", 0, "kind", "pick"
+    ),
+    "transitions[0].actions[0].after: found 0, expected null": _set("transitions", 0, "actions", 0, "after", 0),
+    "transitions[0].actions[1].after: found nothing, expected the id": _set(
+        "transitions", 0, "actions", 1, "after", None
+    ),
+    "problem: subgoals[2].after[0]: found 'tke'": _set("problem", "subgoals", 2, "after", ["tke"]),
+}
+
+
+@pytest.mark.parametrize("message", SUBGOAL_MISTAKES)
+def test_mistakes_about_subgoals_are_named(errands: dict[str, Any], message: str) -> None:
+    spoiled = copy.deepcopy(errands)
+    SUBGOAL_MISTAKES[message](spoiled)
+    with pytest.raises(PlanError) as caught:
+        plan_from_dict(spoiled)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize("message", MISTAKES)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from discs import disc_problem, errand
 from sketches import sketch
 
 from mrtamp.kinematics import inverse
@@ -93,3 +96,21 @@ def test_problem_alone_stands_still(plan: Plan, scene: Scene) -> None:
     q = playback.positions(scene, np.zeros(1))[0]
     for robot in plan.problem.robots:
         assert np.array_equal(q[scene.robots[robot.name].arm], robot.start)
+
+
+def test_what_subgoals_attach_follows_and_stays(tmp_path: Path) -> None:
+    """The token lies still, goes along with the disc that took it, and lies still again where it was let go."""
+    problem = disc_problem(tmp_path)
+    plan = errand(problem)
+    playback, scene = Playback(plan), build_scene(problem)
+    take, drop = playback.events
+    times = playback.times(50)
+    X_WO = object_poses(playback, scene, "token", times)
+    assert np.ptp(X_WO[times <= take.end], axis=0).max() < 1e-9
+    held = (times > take.end) & (times < drop.start)
+    apart = X_WO[held, :2, 3] - playback.q("b", times[held])
+    assert np.ptp(apart, axis=0).max() < 1e-9
+    assert np.ptp(X_WO[times >= drop.start], axis=0).max() < 1e-9
+    assert X_WO[-1, :2, 3] == pytest.approx([0.55, 0.2])
+    assert [playback.mode(t).done for t in (take.start, take.end)] == [set(), {"visit", "take"}]
+    assert not playback.width("a", times).any(), "no gripper, no fingers"

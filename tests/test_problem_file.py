@@ -12,8 +12,13 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from mrtamp.problem import (
     AntipodalGrasps,
+    AtConfiguration,
     AtPose,
+    Attach,
+    CollisionRules,
     ExplicitGrasp,
+    HandAt,
+    HandIn,
     HeldBy,
     InRegion,
     Problem,
@@ -236,6 +241,78 @@ def assert_same(a: Any, b: Any) -> None:
             assert_same(x, y)
     else:
         assert a == (pytest.approx(b, abs=1e-12) if isinstance(a, float) else b)
+
+
+SUBGOALS = """
+subgoals:
+  - {name: look, robots: {left: {q: [0.2, 0.4]}, right: {q: home}}}
+  - name: take
+    robots: {left: {hand: {translation: [0.2, 0, 0.3], rotation: !Rpy {deg: [180, 0, 0]}}}}
+    attach: {object: red, to: left}
+  - name: drop
+    robots: {left: {in: {X_WC: {translation: [0.1, 0, 0.2]}, size: [0.2, 0, 0.1]}}}
+    after: [take]
+    attach: {object: red, to: world}
+collision: {ignore: [[left, table], [left/hand, red]], tolerance: 0.002}
+"""
+
+
+def test_subgoals_and_collision_rules_are_read() -> None:
+    problem = load(PROBLEM + SUBGOALS)
+    look, take, drop = problem.subgoals
+    targets = list(look.targets.values())
+    assert list(look.targets) == ["left", "right"]
+    assert [t.q.tolist() for t in targets if isinstance(t, AtConfiguration)] == [[0.2, 0.4], [0.1, 0.2]]
+    assert (look.after, take.after, drop.after) == ((), (), ("take",))
+    hand, box = take.targets["left"], drop.targets["left"]
+    assert isinstance(hand, HandAt)
+    assert hand.X_WG.rotation().matrix() == pytest.approx(np.diag([1, -1, -1]))
+    assert isinstance(box, HandIn)
+    assert (box.size, box.X_WC.translation().tolist()) == ((0.2, 0.0, 0.1), [0.1, 0, 0.2])
+    assert (look.attach, take.attach, drop.attach) == (None, Attach("red", "left"), Attach("red", "world"))
+    assert problem.collision == CollisionRules((("left", "table"), ("left/hand", "red")), 0.002)
+    plain = load(PROBLEM)
+    assert (plain.subgoals, plain.collision) == ((), CollisionRules())
+
+
+def test_a_sequence_says_what_comes_after_what() -> None:
+    problem = load(PROBLEM + SUBGOALS + "order: sequence\n")
+    assert [s.after for s in problem.subgoals] == [(), ("look",), ("take",)]
+    anything = load(PROBLEM + SUBGOALS + "order: any\n")
+    assert [s.after for s in anything.subgoals] == [(), (), ("take",)]
+
+
+def test_subgoals_are_goal_enough() -> None:
+    goal = PROBLEM[PROBLEM.index("goal:") : PROBLEM.index("cost:")]
+    assert load(change(goal, "") + SUBGOALS).goal == ()
+    assert load(change(goal, "goal: []\n") + SUBGOALS).goal == ()
+
+
+def test_what_subgoals_attach_needs_neither_grasps_nor_gripper() -> None:
+    text = PROBLEM + SUBGOALS
+    red = text[text.index("    grasps:") : text.index("  - name: blue")]
+    assert load(change(red, "    grasps: []\n", text)).object("red").grasps == ()
+    with pytest.raises(ProblemError, match="no grasps"):
+        load(change(red, "    grasps: []\n"))
+    grip = "gripper: {bodies: [hand, finger], joints: {slide: 1.0}, max_width: 0.08}\n"
+    Path("arm.yaml").write_text(change(grip, "", ROBOT))
+    ends = change(red, "    grasps: []\n", text)
+    ends = change("{object: red, in: right_table}", "{object: red, held_by: left}", ends)
+    ends = change("  - {object: blue, on: red}\n", "", ends)
+    assert load(ends).goal[0] == HeldBy("red", "left")
+
+
+def test_subgoals_survive_the_round_trip() -> None:
+    problem = load(PROBLEM + SUBGOALS + "order: sequence\n")
+    data = problem_to_dict(problem)
+    again = problem_from_dict(json.loads(json.dumps(data)))
+    assert problem_to_dict(again) == data
+    assert [s.after for s in again.subgoals] == [(), ("look",), ("take",)]
+    assert [s.attach for s in again.subgoals] == [s.attach for s in problem.subgoals]
+    assert again.collision == problem.collision
+    assert not {"subgoals", "collision"} & set(problem_to_dict(load(PROBLEM))), (
+        "nothing is said about what is not there"
+    )
 
 
 def test_round_trip_through_json() -> None:

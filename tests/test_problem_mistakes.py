@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import json
 from dataclasses import dataclass
@@ -403,6 +402,181 @@ def test_wrong_source(source: str, params: dict[str, int], says: tuple[str, ...]
         assert fragment in str(caught.value)
 
 
+SUBGOALS = """subgoals:
+  - name: look
+    robots: {left: {q: [0.2, 0.4]}, right: {q: home}}
+  - name: take
+    robots: {left: {hand: {translation: [0.2, 0, 0.3]}}}
+    attach: {object: red, to: left}
+  - name: drop
+    robots: {left: {in: {X_WC: {translation: [0.1, 0, 0.2]}, size: [0.2, 0, 0.1]}}}
+    after: [take]
+    attach: {object: red, to: world}
+order: any
+collision: {ignore: [[left, table], [left/hand, red]], tolerance: 0.002}
+"""
+
+SUBGOAL_MISTAKES = {
+    "name taken by an object": Mistake(
+        "name: look", "name: red", "subgoals[0].name", ("'red' again", "objects[0]"), schema=False
+    ),
+    "name taken by a robot": Mistake(
+        "name: look", "name: left", "subgoals[0].name", ("'left' again", "robots[0]"), schema=False
+    ),
+    "name twice": Mistake(
+        "name: drop", "name: take", "subgoals[2].name", ("'take' again", "subgoals[1]"), schema=False
+    ),
+    "no name": Mistake("- name: look\n    robots", "- robots", "subgoals[0]", ("a mapping with a 'name'",)),
+    "no robots": Mistake(
+        "robots: {left: {q: [0.2, 0.4]}, right: {q: home}}", "robots: {}", "subgoals[0].robots", ("{}",)
+    ),
+    "robots as a list": Mistake(
+        "{left: {q: [0.2, 0.4]}, right: {q: home}}", "[left]", "subgoals[0].robots", ("['left']", "{NAME: {q: [...]}}")
+    ),
+    "unknown robot": Mistake(
+        "right: {q: home}", "rigth: {q: home}", "subgoals[0].robots", ("'rigth'", "did you mean 'right'"), schema=False
+    ),
+    "unknown target": Mistake(
+        "right: {q: home}", "right: {config: home}", "subgoals[0].robots.right.config", ("'config'", "q, hand, in")
+    ),
+    "two targets": Mistake(
+        "right: {q: home}", "right: {q: home, hand: {}}", "subgoals[0].robots.right", ("exactly one of",)
+    ),
+    "no target": Mistake("right: {q: home}", "right: {}", "subgoals[0].robots.right", ("exactly one of",)),
+    "too few positions": Mistake(
+        "q: [0.2, 0.4]", "q: [0.2]", "subgoals[0].robots.left.q", ("1 numbers", "shoulder, elbow"), schema=False
+    ),
+    "beyond the limits": Mistake(
+        "q: [0.2, 0.4]", "q: [0.2, 9]", "subgoals[0].robots.left.q[1]", ("found 9 for elbow", "limits"), schema=False
+    ),
+    "a word for a configuration": Mistake(
+        "q: [0.2, 0.4]", "q: away", "subgoals[0].robots.left.q", ("'away'", "shoulder, elbow")
+    ),
+    "box without size": Mistake(
+        "{X_WC: {translation: [0.1, 0, 0.2]}, size: [0.2, 0, 0.1]}",
+        "{X_WC: {translation: [0.1, 0, 0.2]}}",
+        "subgoals[2].robots.left.in",
+        ("no key 'size'",),
+    ),
+    "negative box": Mistake(
+        "[0.2, 0, 0.1]", "[0.2, -1, 0.1]", "subgoals[2].robots.left.in.size[1]", ("-1", "at least 0")
+    ),
+    "after something unknown": Mistake(
+        "after: [take]",
+        "after: [tke]",
+        "subgoals[2].after[0]",
+        ("'tke'", "look, take", "did you mean 'take'"),
+        schema=False,
+    ),
+    "after itself": Mistake(
+        "after: [take]", "after: [drop]", "subgoals[2].after[0]", ("'drop'", "look, take"), schema=False
+    ),
+    "after twice": Mistake("after: [take]", "after: [take, take]", "subgoals[2].after", ("each subgoal once",)),
+    "after a name, not a list": Mistake("after: [take]", "after: take", "subgoals[2].after", ("'take'", "a list")),
+    "a ring": Mistake(
+        "attach: {object: red, to: left}",
+        "attach: {object: red, to: left}\n    after: [drop]",
+        "subgoals[1]",
+        ("take after drop after take",),
+        schema=False,
+        marker="  - name: take",
+    ),
+    "unknown object": Mistake(
+        "{object: red, to: left}",
+        "{object: rad, to: left}",
+        "subgoals[1].attach.object",
+        ("'rad'", "red, blue"),
+        schema=False,
+    ),
+    "to a robot elsewhere": Mistake(
+        "{object: red, to: left}",
+        "{object: red, to: right}",
+        "subgoals[1].attach.to",
+        ("'right', which is not at this subgoal", "robots of the subgoal: left"),
+        schema=False,
+    ),
+    "to something unknown": Mistake(
+        "{object: red, to: world}",
+        "{object: red, to: tabel}",
+        "subgoals[2].attach.to",
+        ("'tabel'", "left, table, blue, world"),
+        schema=False,
+    ),
+    "to itself": Mistake(
+        "{object: red, to: world}",
+        "{object: red, to: red}",
+        "subgoals[2].attach.to",
+        ("'red'", "table, blue"),
+        schema=False,
+    ),
+    "attached to nothing": Mistake("{object: red, to: world}", "{object: red}", "subgoals[2].attach", ("no key 'to'",)),
+    "unknown order": Mistake("order: any", "order: all", "order", ("'all'", "any, sequence")),
+    "three in a pair": Mistake(
+        "[left, table]", "[left, table, red]", "collision.ignore[0]", ("['left', 'table', 'red']", "a pair such as")
+    ),
+    "unknown thing": Mistake(
+        "[left, table]",
+        "[left, tabl]",
+        "collision.ignore[0][1]",
+        ("'tabl'", "left, right, table, red, blue"),
+        schema=False,
+    ),
+    "unknown body": Mistake(
+        "left/hand",
+        "left/hands",
+        "collision.ignore[1][0]",
+        ("'hands'", "bodies of left", "did you mean 'hand'"),
+        schema=False,
+    ),
+    "body of no robot": Mistake(
+        "left/hand", "lift/hand", "collision.ignore[1][0]", ("'lift/hand'", "ROBOT/BODY"), schema=False
+    ),
+    "a thing with itself": Mistake(
+        "[left, table]", "[table, table]", "collision.ignore[0]", ("'table' with itself",), schema=False
+    ),
+    "negative tolerance": Mistake("tolerance: 0.002", "tolerance: -1", "collision.tolerance", ("-1", "at least 0")),
+    "unknown rule": Mistake("tolerance: 0.002", "tol: 0.002", "collision.tol", ("'tol'", "ignore, tolerance")),
+}
+
+
+@pytest.mark.parametrize("name", SUBGOAL_MISTAKES)
+def test_mistake_about_subgoals_gets_one_clear_error(name: str) -> None:
+    mistake = SUBGOAL_MISTAKES[name]
+    text = change(mistake.old, mistake.new, PROBLEM + SUBGOALS)
+    place = text.index(mistake.marker) if mistake.marker else (PROBLEM + SUBGOALS).index(mistake.old)
+    with pytest.raises(ProblemError) as caught:
+        load(text)
+    message = str(caught.value)
+    assert message.startswith(f"example.yaml:{text[:place].count(chr(10)) + 1}: {mistake.key}: "), message
+    for fragment in mistake.says:
+        assert fragment in message, message
+    if mistake.schema:
+        assert not schema("problem").is_valid(parse_document(text, "x", Path.cwd()).data)
+
+
+def test_a_sequence_against_after_is_a_ring() -> None:
+    text = change("right: {q: home}}", "right: {q: home}}\n    after: [drop]", PROBLEM + SUBGOALS)
+    load(text)
+    with pytest.raises(ProblemError, match="look after drop after take after look"):
+        load(change("order: any", "order: sequence", text))
+
+
+def test_a_robot_without_grasp_frame_has_no_hand_to_go_anywhere() -> None:
+    bare = ROBOT[: ROBOT.index("gripper:")]
+    Path("bare.yaml").write_text(bare)
+    text = change("{name: left, model: arm.yaml", "{name: left, model: bare.yaml", PROBLEM + SUBGOALS)
+    with pytest.raises(ProblemError, match=r"subgoals\[1\].robots.left: found the hand of 'left', .* with one: right"):
+        load(text)
+
+
+def test_without_goal_and_subgoals_there_is_nothing_to_plan() -> None:
+    goal = PROBLEM[PROBLEM.index("goal:") : PROBLEM.index("cost:")]
+    for text in (change(goal, ""), change(goal, "") + "subgoals: []\n", change(goal, "goal: []\nsubgoals: []\n")):
+        with pytest.raises(ProblemError, match="goal"):
+            load(text)
+        assert not schema("problem").is_valid(parse_document(text, "x", Path.cwd()).data)
+
+
 # The published schema.
 
 
@@ -421,6 +595,9 @@ def test_schema_accepts_what_ships() -> None:
         schema("robot").validate(read_document(file).data)
     schema("robot").validate(parse_document(ROBOT, "robot", Path.cwd()).data)
     schema("problem").validate(example_data())
+    visits = parse_document(PROBLEM + SUBGOALS, "visits", Path.cwd()).data
+    schema("problem").validate(visits)
+    schema("problem").validate(problem_to_dict(problem_from_dict(visits)))
     schema("problem").validate(problem_to_dict(load(PROBLEM)))
 
 
@@ -453,7 +630,7 @@ def places(data: Any) -> list[tuple[Any, Any]]:
 @given(choice=st.integers(0, 10_000), junk=JUNK, remove=st.booleans())
 def test_loader_and_schema_agree_on_damaged_files(choice: int, junk: Any, remove: bool) -> None:
     """Damage anything anywhere: the loader accepts or raises ProblemError, and accepts nothing the schema refuses."""
-    data = copy.deepcopy(example_data())
+    data = parse_document(PROBLEM + SUBGOALS, "example", Path.cwd()).data
     everywhere = places(data)
     container, key = everywhere[choice % len(everywhere)]
     if remove:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+from pathlib import Path
 
 import pytest
+from discs import disc_problem, errand
 from sketches import sketch
 
 from mrtamp import report
@@ -36,6 +39,26 @@ def test_text_has_aligned_columns(plan: Plan) -> None:
     assert len(lines) == 2 + len(plan.transitions)
     column = lines[0].index("robots")
     assert [line[column:].split()[0] for line in lines[2:]] == ["arm1", "arm1", "arm2"]
+
+
+def test_subgoals_have_words_too(tmp_path: Path) -> None:
+    plan = errand(disc_problem(tmp_path))
+    rows = report.timeline(plan)
+    assert [(r.step, r.kind, r.subgoal, r.object, r.source, r.target) for r in rows] == [
+        (1, "reach", "visit", "", "", ""),
+        (1, "reach", "take", "token", "start of token", "b"),
+        (2, "reach", "drop", "token", "b", "world"),
+    ]
+    assert [r.sentence for r in rows] == [
+        "a reaches visit",
+        "b reaches take and takes token",
+        "b reaches drop, token stays there",
+    ]
+    lines = report.timeline_text(plan).splitlines()[2:]
+    assert lines[0].endswith("visit") and lines[2].endswith("drop: b -> world")
+    together = dataclasses.replace(rows[1], robots=("a", "b"))
+    assert together.sentence == "a and b reach take and b takes token"
+    assert json.loads(json.dumps(report.summary(plan)))["timeline"][1]["subgoal"] == "take"
 
 
 def test_a_plan_without_transitions_has_words_too(plan: Plan) -> None:

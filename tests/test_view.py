@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import Page, changed, open_page
+from discs import disc_problem, errand
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydrake.geometry import Meshcat
@@ -19,6 +20,7 @@ from sketches import sketch
 
 import mrtamp
 from mrtamp.plan import Plan
+from mrtamp.stage import GHOSTS
 from mrtamp.view import _slerp, keyframes, view, write_html
 
 
@@ -114,6 +116,18 @@ def test_names_cannot_break_the_page(plan: Plan, tmp_path: Path) -> None:
     assert "<title>&lt;/script&gt;&lt;b&gt;&amp;name</title>" in text
 
 
+def test_subgoals_are_listed_and_their_targets_drawn(tmp_path: Path) -> None:
+    """Also of robots that slide: they stand where they start, not where their rails are fixed."""
+    problem = disc_problem(tmp_path)
+    page = write_html(errand(problem), tmp_path / "discs.html").read_text()
+    assert "a reaches visit" in page and "b reaches drop, token stays there" in page
+    meshcat = Meshcat()
+    view(problem, meshcat)
+    for target in ("visit/a", "take/b", "drop/b"):
+        assert meshcat.HasPath(f"{GHOSTS}/{target}")
+    assert not meshcat.HasPath(f"{GHOSTS}/visit/b")
+
+
 def test_pages_do_not_inherit_from_each_other(plan: Plan, file: Path, tmp_path: Path) -> None:
     before = write_html(plan.problem, tmp_path / "a.html").read_text(encoding="utf-8")
     write_html(plan, tmp_path / "b.html")
@@ -126,7 +140,8 @@ def test_pages_and_windows_survive_threads() -> None:
     code = """if True:
         import gc, threading
         import mrtamp
-        from mrtamp.view import inline, view
+        from mrtamp.stage import GHOSTS
+from mrtamp.view import inline, view
         problem = mrtamp.load_problem("box")
         def work():
             inline(problem)

@@ -12,12 +12,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from mrtamp.check_attachments import AttachmentJudge, carrier, has_cycle, same_pose
+from mrtamp.check_attachments import AttachmentJudge, carrier, has_cycle
 from mrtamp.check_motion import Contact, Motion, MotionJudge, Timeline, held_pairs
+from mrtamp.check_reach import not_there, same_pose
 from mrtamp.check_report import FirstViolation, Report, Side, Violation
 from mrtamp.check_scene import JudgeScene
 from mrtamp.modes import JOINT_TOLERANCE, POSITION_TOLERANCE, Attachment, Mode, start_mode
-from mrtamp.plan import Plan, Segment, plan_cost
+from mrtamp.plan import Plan, Segment, Transition, plan_cost
 from mrtamp.problem import AtPose, HeldBy, InRegion, Problem, RobotAt
 
 __all__ = ["Checker", "Report", "Side", "Violation", "check_plan"]
@@ -141,6 +142,9 @@ class Checker:
     def _modes(self, plan: Plan, report: Report) -> None:
         """The start mode, every attachment, every transition, and objects that stay where they are while it happens."""
         start = start_mode(self.problem)
+        if plan.segments[0].mode.done:
+            text = f"{', '.join(sorted(plan.segments[0].mode.done))} cannot be reached before the plan begins"
+            report.add(Violation("start", text, 0))
         for name, a in plan.segments[0].mode.of.items():
             b = start.of[name]
             there = (
@@ -161,6 +165,7 @@ class Checker:
         for k, transition in enumerate(plan.transitions):
             one, two = plan.segments[k], plan.segments[k + 1]
             self.attachments.transition(k, transition, one.mode, two.mode, report)
+            self._reached(k, transition, one, report)
             old, new = (self._poses(s.mode, self._composite(s)[[i]]) for s, i in ((one, -1), (two, 0)))
             for name in one.mode.of:
                 if one.mode.of[name] is not two.mode.of[name] and not same_pose(old[name], new[name]):
@@ -168,10 +173,25 @@ class Checker:
                     text = f"{name} jumps by {gap * 1e3:.2f} mm at transition {k}"
                     report.add(Violation("continuity", text, k, max(one.length - 2, 0), 1.0, gap))
 
+    def _reached(self, k: int, transition: Transition, segment: Segment, report: Report) -> None:
+        """The robots of every subgoal that a transition reaches are at their targets at the end of the segment."""
+        known = {s.name: s for s in self.problem.subgoals}
+        for action in transition.actions:
+            if action.subgoal in known:
+                subgoal = known[action.subgoal]
+                X_WG = self.world.grasp_frames(self._composite(segment)[[-1]], subgoal.targets)
+                q = {name: waypoints[-1] for name, waypoints in segment.q.items()}
+                for why in not_there(subgoal, q, {name: X[0] for name, X in X_WG.items()}):
+                    text = f"transition {k}: reach of {subgoal.name}: {why}"
+                    report.add(Violation("transition", text, k, max(segment.length - 2, 0), 1.0))
+
     def _goal(self, plan: Plan, report: Report) -> None:
-        """Every condition of the goal holds at the end."""
+        """Every subgoal has been reached, and every condition of the goal holds at the end."""
         k = len(plan.segments) - 1
         mode = plan.segments[-1].mode
+        for subgoal in self.problem.subgoals:
+            if subgoal.name not in mode.done:
+                report.add(Violation("goal", f"{subgoal.name} is never reached", k))
         for c in self.problem.goal:
             why = None
             if isinstance(c, RobotAt):
@@ -239,14 +259,15 @@ class Checker:
         for k, line in enumerate(lines):
             changed = list(plan.segments[0].mode.of)
             if k > 0:
-                changed = [action.object for action in plan.transitions[k - 1].actions]
-                for action in plan.transitions[k - 1].actions:
-                    if not action.before.held:
-                        lifting[action.object] = self._contact(action.before)
-                    elif not action.after.held:
-                        lifting.pop(action.object, None)
+                changes = [(a.before, a.after) for a in plan.transitions[k - 1].actions if a.before and a.after]
+                changed = [before.object for before, _ in changes]
+                for before, after in changes:
+                    if not before.held:
+                        lifting[before.object] = self._contact(before)
+                    elif not after.held:
+                        lifting.pop(before.object, None)
                 self._fingers(motions[k - 1], motions[k], judge, report)
-            judge.resting(motions[k], changed, report)
+            judge.resting(motions[k], changed, report, {(c.object, c.other) for c in lifting.values()})
             windows = dict(landings[k])
             for name, contact in list(lifting.items()):
                 end = judge.walk(line, contact, report, backward=False)
@@ -264,8 +285,8 @@ class Checker:
         landing: dict[str, Contact] = {}
         for k in reversed(range(len(plan.transitions))):
             for action in plan.transitions[k].actions:
-                if not action.after.held:
-                    landing[action.object] = self._contact(action.after)
+                if action.after is not None and not action.after.held:
+                    landing[action.after.object] = self._contact(action.after)
             landing = {name: c for name, c in landing.items() if name in lines[k].motion.carried}
             for name, contact in list(landing.items()):
                 begin = judge.walk(lines[k], contact, report, backward=True)

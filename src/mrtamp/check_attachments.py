@@ -8,10 +8,12 @@ problem and the attachment; no sampler is consulted.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import product
 
 import numpy as np
 
 from mrtamp.check_motion import TOUCH
+from mrtamp.check_reach import attaches, reach_rules, same_pose
 from mrtamp.check_report import Report, Violation
 from mrtamp.check_scene import JudgeScene
 from mrtamp.kinematics import inverse
@@ -20,11 +22,8 @@ from mrtamp.plan import Action, Transition
 from mrtamp.problem import WORLD, AntipodalGrasps, ExplicitGrasp, MovableObject, Support
 from mrtamp.resting import bounding_box, face_normal, face_rotation
 
-
-def same_pose(X: np.ndarray, Y: np.ndarray) -> bool:
-    """Whether two poses agree to 0.1 mm and 1 mrad."""
-    angle = np.linalg.norm(X[:3, :3] - Y[:3, :3]) / np.sqrt(2)  # |R - S|_F = 2 sqrt(2) sin(angle / 2)
-    return bool(np.linalg.norm(X[:3, 3] - Y[:3, 3]) <= POSITION_TOLERANCE and angle <= ANGLE_TOLERANCE)
+KINDS = {"pick": (False, True), "place": (True, False), "handover": (True, True), "reach": None}
+"""Kinds of actions, and whether the object is held before and after."""
 
 
 def carrier(mode: Mode, name: str) -> tuple[str, np.ndarray, bool]:
@@ -86,6 +85,8 @@ class AttachmentJudge:
 
     def _grasp(self, a: Attachment) -> str | None:
         """What is wrong with a grasp."""
+        if a.width is None and any(attaches(s, a) for s in self.problem.subgoals):
+            return None
         thing, robot = self.objects[a.object], self.robots[a.parent]
         gripper = robot.model.gripper
         if gripper is None:
@@ -110,6 +111,13 @@ class AttachmentJudge:
     def _rest(self, a: Attachment, start: Attachment) -> str | None:
         """What is wrong with the place where an object rests."""
         thing = self.objects[a.object]
+        tolerance = self.problem.collision.tolerance
+        if any(attaches(s, a) for s in self.problem.subgoals):
+            gap = self._gap(a)
+            # It is fixed where it was let go, in the air if need be.
+            if gap is None or gap >= -TOUCH - tolerance:
+                return None
+            return f"is fixed {-gap * 1e3:.1f} mm inside {a.parent}, expected to be outside"
         support = self.supports.get(a.support or "")
         if support is not None:
             why = self._on_support(thing, support, a)
@@ -118,7 +126,7 @@ class AttachmentJudge:
         elif not (a.support == start.support and a.parent == start.parent and same_pose(a.X_PO, start.X_PO)):
             return f"rests on {a.support!r}, expected one of the supports {', '.join(self.supports)}"
         gap = self._gap(a)
-        if gap is not None and not -TOUCH <= gap <= TOUCH:
+        if gap is not None and not -TOUCH - tolerance <= gap <= TOUCH:
             where = f"{gap * 1e3:.1f} mm away from" if gap > 0 else f"{-gap * 1e3:.1f} mm inside"
             return f"rests {where} {a.parent}, expected to touch it within {TOUCH * 1e3:g} mm"
         return None
@@ -152,9 +160,10 @@ class AttachmentJudge:
         return None
 
     def _gap(self, a: Attachment) -> float | None:
-        """Signed distance (m) between a resting object and its parent; None where the parent has no solid."""
-        mine, theirs = self.world.of.get(a.object, []), self.world.of.get(a.parent, [])
-        if not mine or not theirs:
+        """Signed distance (m) between a resting object and its parent; None where they have no solids that collide."""
+        solids = product(self.world.of.get(a.object, []), self.world.of.get(a.parent, []))
+        pairs = [pair for pair in solids if self.world.may_collide(*pair)]
+        if not pairs:
             return None
         X_WP = self.X_WB.get(a.parent, np.eye(4))
         poses = {a.object: X_WP @ a.X_PO}
@@ -162,7 +171,7 @@ class AttachmentJudge:
             poses[a.parent] = X_WP
         z = self.world.base[self.world.columns][None]
         query = self.world.query(self.world.positions(z, poses)[0])
-        return min(self.world.distance(query, i, j) for i in mine for j in theirs)
+        return min(self.world.distance(query, *pair) for pair in pairs)
 
     # -- transitions ------------------------------------------------------------------------------------------------
 
@@ -173,8 +182,8 @@ class AttachmentJudge:
             report.add(Violation("transition", f"transition {k}: {text}", k))
 
         changed = {n for n in before.of if before.of[n] is not after.of[n]}
-        named = [action.object for action in transition.actions]
-        if not named:
+        named = [action.object for action in transition.actions if action.object is not None]
+        if not transition.actions:
             wrong("nothing happens, expected at least one action")
         if len(set(named)) != len(named):
             wrong("an object takes part in two actions")
@@ -184,27 +193,44 @@ class AttachmentJudge:
         if set(named) != changed:
             wrong(f"the actions change {sorted(named)}, the modes differ in {sorted(changed)}")
             return
+        reached = {action.subgoal for action in transition.actions if action.subgoal is not None}
+        if after.done != before.done | reached:
+            wrong(f"the actions reach {sorted(reached)}, the modes say {sorted(before.done)} and {sorted(after.done)}")
         for action in transition.actions:
             why = self._action(action, before, after)
             if why:
-                wrong(f"{action.kind} of {action.object}: {why}")
+                wrong(f"{action.kind} of {action.subgoal or action.object}: {why}")
 
     def _action(self, action: Action, before: Mode, after: Mode) -> str | None:
         """What is wrong with one action."""
         old, new = action.before, action.after
-        if old is not before.of.get(action.object) or new is not after.of.get(action.object):
+        if action.kind not in KINDS:
+            return f"unknown kind, expected {', '.join(KINDS)}"
+        if action.kind == "reach":
+            why = reach_rules(self.problem, action, before)
+        elif action.subgoal is not None:
+            why = "only a reach reaches a subgoal"
+        else:
+            why = "no object is changed" if old is None or new is None else None
+        if why or old is None or new is None:
+            return why
+        if old is not before.of.get(new.object) or new is not after.of.get(new.object):
             return "its attachments are not those of the modes before and after"
-        if action.kind not in ("pick", "place", "handover"):
-            return "unknown kind, expected pick, place or handover"
-        if before.loaded & {action.object}:
-            on_it = [a.object for a in before.attachments if not a.held and a.parent == action.object]
+        return self._change(action, old, new, before, after)
+
+    def _change(self, action: Action, old: Attachment, new: Attachment, before: Mode, after: Mode) -> str | None:
+        """What is wrong with what an action does to an object."""
+        if before.loaded & {new.object}:
+            on_it = [a.object for a in before.attachments if not a.held and a.parent == new.object]
             return f"{', '.join(on_it)} rests on it"
-        shape = (old.held, new.held)
-        if shape != {"pick": (False, True), "place": (True, False), "handover": (True, True)}[action.kind]:
-            return "that is not what happens to its attachment"
-        expected = tuple(a.parent for a in (old, new) if a.held)
-        if tuple(action.robots) != expected:
-            return f"the robots are {', '.join(action.robots)}, expected {', '.join(expected)}"
+        if action.kind != "reach":
+            if (old.held, new.held) != KINDS[action.kind]:
+                return "that is not what happens to its attachment"
+            expected = tuple(a.parent for a in (old, new) if a.held)
+            if tuple(action.robots) != expected:
+                return f"the robots are {', '.join(action.robots)}, expected {', '.join(expected)}"
+            if (new.width is None) if new.held else any(attaches(s, new) for s in self.problem.subgoals):
+                return "only a reach fixes an object like that"
         if new.held and (old.parent == new.parent if old.held else False):
             return f"{new.parent} already holds it"
         if new.held and new.parent in before.held:

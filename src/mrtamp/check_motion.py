@@ -9,13 +9,15 @@ Contact is allowed in four cases only.  What a robot holds may touch its gripper
 rests on; an object that was just picked may touch what it stood on until they are TOUCH apart for the first time; and
 one that is about to be placed may touch what it will stand on since they were TOUCH apart for the last time.  In the
 last two cases they penetrate no deeper than TOUCH, and the object stays within CONTACT_TRAVEL of the pose in which it
-rested or will rest, so that nothing is dragged along a surface.
+rested or will rest, so that nothing is dragged along a surface.  Other pairs may penetrate, at any one instant, by no
+more in total than the problem tolerates (nothing, unless it says so); pairs it ignores do not count anywhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -192,6 +194,7 @@ class MotionJudge:
     def __init__(self, world: JudgeScene, resolution: float) -> None:
         self.world = world
         self.resolution = resolution
+        self.tolerance = world.problem.collision.tolerance
 
     def judge(self, line: Timeline, report: Report, exempt: Mapping[tuple[str, str], tuple[float, float]]) -> None:
         """Report every collision on `line`.
@@ -219,7 +222,7 @@ class MotionJudge:
         at, pair = self._open(pairs, s, d, moved)
         d[at, pair] = self._distances(line, s, at, pairs.solids[pair], report)
         report.clearance(d[at, pair][pairs.inside(s[at], pair)])
-        self._sift(line, s, pairs, d, report).report(report)
+        self._sift(line, s, pairs, d, report, exempt).report(report)
 
     def _open(self, pairs: _Pairs, s: np.ndarray, d: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Samples and pairs whose bounds d (S, P) decide nothing: about the sample, or about a neighbouring stretch."""
@@ -245,10 +248,20 @@ class MotionJudge:
             out[e] = self.world.distance(query, i, j)
         return out
 
-    def _sift(self, line: Timeline, s: np.ndarray, pairs: _Pairs, d: np.ndarray, report: Report) -> _Hits:
+    def _sift(
+        self,
+        line: Timeline,
+        s: np.ndarray,
+        pairs: _Pairs,
+        d: np.ndarray,
+        report: Report,
+        exempt: Mapping[tuple[str, str], tuple[float, float]],
+    ) -> _Hits:
         """Note the samples in collision, and bisect the stretches that their ends do not certify."""
         hits = _Hits(self.world, line)
         hit = pairs.inside(s[:, None], slice(None)) & (d <= 0.0)
+        for n in np.flatnonzero(hit.any(axis=1)):
+            hit[n] &= not self._tolerated(line, float(s[n]), exempt)
         for n, c in zip(*np.nonzero(hit), strict=True):
             hits.note(pairs.solids[c], float(s[n]), float(d[n, c]))
         if hits and report.first_only:
@@ -269,6 +282,8 @@ class MotionJudge:
             inside = pairs.inside(middle, pair)
             report.clearance(dm[inside])
             hit = inside & (dm <= 0.0)
+            for n in np.unique(at[hit]):
+                hit[at == n] &= not self._tolerated(line, float(samples[n]), exempt)
             for row in np.flatnonzero(hit):
                 hits.note(pairs.solids[pair[row]], float(middle[row]), float(dm[row]))
             # A pair that collides is not searched any further here: its stretch is known to be bad.
@@ -281,10 +296,31 @@ class MotionJudge:
             lo, hi, d0, d1, pair = lo[keep], hi[keep], d0[keep], d1[keep], pair[keep]
         return hits
 
-    def resting(self, motion: Motion, names: list[str], report: Report) -> None:
-        """Objects at rest do not touch each other nor the world, except what they rest on."""
+    def _tolerated(self, line: Timeline, s: float, exempt: Mapping[tuple[str, str], tuple[float, float]]) -> bool:
+        """Whether all penetrations of the configuration at s add up to no more than the problem tolerates."""
+        if self.tolerance <= 0.0:
+            return False
+        q, _ = line.state(np.array([s]))
+        total = 0.0
+        for pair, depth in self.world.penetrations(self.world.query(q[0])).items():
+            one, two = (self.world.solids[i].side.owner for i in pair)
+            low, high = exempt.get((one, two)) or exempt.get((two, one)) or (0.0, line.length)
+            if pair not in line.motion.allowed and low <= s <= high:
+                total += depth
+        return total <= self.tolerance
+
+    def resting(
+        self, motion: Motion, names: list[str], report: Report, standing: Collection[tuple[str, str]] = ()
+    ) -> None:
+        """Objects at rest do not touch each other nor the world, except what they rest on.
+
+        `names` are the objects to look at, `standing` pairs (object, other) that have been touching since before.
+        """
         world = self.world
         poses = motion.resting
+        if self.tolerance > 0.0:
+            names = list(poses)  # what is tolerated is the total
+        found: list[Violation] = []
         fixed = [i for i, solid in enumerate(world.solids) if solid.joint < 0 and solid.side.kind != "object"]
         query = None
         done = set(motion.allowed)
@@ -299,6 +335,8 @@ class MotionJudge:
                     if pair in done or box_gap(p[:3], world.solids[j].half) > world.solids[i].bound + TOUCH:
                         continue
                     done.add(pair)
+                    if not world.may_collide(*pair) or (name, world.solids[j].side.owner) in standing:
+                        continue
                     if query is None:
                         query = world.query(world.positions(motion.z[:1], poses)[0])
                     d = world.distance(query, i, j)
@@ -306,7 +344,10 @@ class MotionJudge:
                     if d <= 0.0:
                         a, b = world.solids[i].side, world.solids[j].side
                         text = f"{a} and {b} collide at rest, {-d * 1e3:.2f} mm deep"
-                        report.add(Violation("collision", text, motion.segment, 0, 0.0, -d, (a, b)))
+                        found.append(Violation("collision", text, motion.segment, 0, 0.0, -d, (a, b)))
+        if sum(v.value or 0.0 for v in found) > self.tolerance or (found and self.tolerance <= 0.0):
+            for violation in found:
+                report.add(violation)
 
     # -- contact phases ---------------------------------------------------------------------------------------------
 
@@ -316,7 +357,8 @@ class MotionJudge:
         Returns the s at which the contact phase ends (begins), or None when it spans the whole motion.
         """
         world, motion = self.world, line.motion
-        pairs = [(i, j) for i in world.of.get(contact.object, []) for j in world.of.get(contact.other, [])]
+        solids = product(world.of.get(contact.object, []), world.of.get(contact.other, []))
+        pairs = [pair for pair in solids if world.may_collide(*pair)]
         if not pairs:
             return line.length if backward else 0.0
         rate = line.rates(*np.array(pairs).T).max(axis=0)
@@ -335,13 +377,14 @@ class MotionJudge:
             if d > TOUCH:
                 return float(s)
             slid = self._moved(contact, X_FO)
-            if d < -TOUCH or slid > CONTACT_TRAVEL:
+            deep = d < -TOUCH - self.tolerance
+            if deep or slid > CONTACT_TRAVEL:
                 step, fraction = line.step(float(s))
                 a, b = (world.solids[i].side for i in pairs[0])
                 verb = "before it is placed on" if backward else "after it is picked from"
                 what = (
                     f"{a} is {-d * 1e3:.2f} mm deep in {b} {verb} it"
-                    if d < -TOUCH
+                    if deep
                     else f"{a} has moved {slid * 1e3:.1f} mm along {b} in contact {verb} it"
                 )
                 report.add(Violation("contact", what, motion.segment, step, fraction, max(-d, slid), (a, b)))

@@ -19,7 +19,7 @@ from mrtamp.check_bounds import Envelopes, Screws, capsule_around
 from mrtamp.check_report import Side
 from mrtamp.kinematics import quaternions
 from mrtamp.problem import WORLD, MrtampError, Problem
-from mrtamp.scene import Scene, build_scene
+from mrtamp.scene import Scene, build_scene, touching_bodies
 
 UNBOUNDED_SLIDE = 10.0
 """A prismatic joint without limits is judged within this many metres of zero."""
@@ -197,9 +197,9 @@ class JudgeScene:
                 self.of.setdefault(solid.side.owner, []).append(i)
         self.index = {solid.id: i for i, solid in enumerate(self.solids)}
         self.gripper: dict[str, list[int]] = {}
+        """Solids of a robot that may touch what it holds."""
         for name, robot in self.scene.robots.items():
-            gripper = robot.robot.model.gripper
-            hand = gripper.bodies if gripper else ()
+            hand = touching_bodies(robot.robot.model)
             mine = ((i, s.side) for i, s in enumerate(self.solids) if s.side.kind == "robot" and s.side.owner == name)
             self.gripper[name] = [i for i, side in mine if side.body in hand]
         n = len(self.columns)
@@ -270,6 +270,10 @@ class JudgeScene:
                 own = a.side.kind == "object" and a.side.owner == b.side.owner
                 self.unfiltered[j, i] = not own and not inspector.CollisionFiltered(a.id, b.id)
 
+    def may_collide(self, i: int, j: int) -> bool:
+        """Whether two solids can collide at all: not of one rigid thing, and not a pair the problem ignores."""
+        return bool(self.unfiltered[min(i, j), max(i, j)])
+
     # -- distances --------------------------------------------------------------------------------------------------
 
     def positions(self, z: np.ndarray, X_WO: Mapping[str, np.ndarray], base: np.ndarray | None = None) -> np.ndarray:
@@ -288,6 +292,11 @@ class JudgeScene:
         """Drake's query object with the plant at positions q (nq,)."""
         self.plant.SetPositions(self.context, q)
         return self._query_port.Eval(self._graph_context)
+
+    def penetrations(self, query) -> dict[tuple[int, int], float]:
+        """Depth (m) of every two solids i < j that penetrate each other and may collide."""
+        pairs = (sorted((self.index[p.id_A], self.index[p.id_B])) for p in query.ComputePointPairPenetration())
+        return {(i, j): max(-self.distance(query, i, j), 0.0) for i, j in pairs if self.may_collide(i, j)}
 
     def distance(self, query, i: int, j: int) -> float:
         """Signed distance (m) of two solids; collision filters do not apply."""

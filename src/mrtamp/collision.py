@@ -3,7 +3,7 @@
 Every query is answered by Drake's `QueryObject.HasCollisions` on a small plant of its own (DESIGN section 4).  What a
 robot holds is a *slot*: a free body of the object's shape that may touch the gripper's bodies, so that changing a
 mode never changes a collision filter.  Between two robots the arms' shapes are padded, because edges are checked at
-samples only.
+samples only.  Where a problem tolerates some penetration, depths are asked for once something collides at all.
 """
 
 from __future__ import annotations
@@ -43,9 +43,14 @@ class Counts:
         return dict(vars(self))
 
 
-def shape_key(item: MovableObject) -> str:
-    """Objects with the same key share one slot: their collision geometry is the same."""
-    return f"{item.shape.kind}{item.shape.size}" if item.shape else f"model {item.model}"
+def slot_keys(problem: Problem) -> dict[str, str]:
+    """Objects with the same key share one slot: their collision geometry and their collision rules are the same."""
+    out = {}
+    for item in problem.objects:
+        shape = f"{item.shape.kind}{item.shape.size}" if item.shape else f"model {item.model}"
+        passes = {b if a == item.name else a for a, b in problem.collision.ignore if item.name in (a, b)}
+        out[item.name] = shape + "".join(f" through {thing}" for thing in sorted(passes))
+    return out
 
 
 def bisection_order(n: int) -> np.ndarray:
@@ -61,11 +66,13 @@ def bisection_order(n: int) -> np.ndarray:
     return np.array(order)
 
 
-def _slots(problem: Problem, prefix: str) -> dict[str, MovableObject]:
-    out: dict[str, MovableObject] = {}
+def _slots(problem: Problem, prefix: str) -> tuple[dict[str, MovableObject], dict[str, str]]:
+    """Slot name -> an object of its shape, and object name -> the slot that shows it."""
+    slots: dict[str, MovableObject] = {}
+    slot_of = {name: f"{prefix}:{key}" for name, key in slot_keys(problem).items()}
     for item in problem.objects:
-        out.setdefault(f"{prefix}:{shape_key(item)}", item)
-    return out
+        slots.setdefault(slot_of[item.name], item)
+    return slots, slot_of
 
 
 def _radius(scene: Scene, body_geometries: Sequence) -> tuple[np.ndarray, float]:
@@ -120,8 +127,9 @@ class RobotWorld:
     def __init__(self, problem: Problem, name: str, counts: Counts) -> None:
         self.name = name
         self.counts = counts
+        self.tolerance = problem.collision.tolerance
         resting = {o.name: o for o in problem.objects}
-        slots = _slots(problem, "held")
+        slots, self.slot_of = _slots(problem, "held")
         scene = build_scene(problem, robots=[name], free_bodies={**resting, **slots})
         self.scene = scene
         self.in_scene = scene.robots[name]
@@ -140,7 +148,6 @@ class RobotWorld:
         declare.ExcludeWithin(GeometrySet(objects)).ExcludeBetween(GeometrySet(objects), GeometrySet(static))
         declare.ExcludeWithin(GeometrySet(held)).ExcludeBetween(GeometrySet(held), GeometrySet(hand))
         manager.Apply(declare)
-        self.slot_of = {o.name: f"held:{shape_key(o)}" for o in problem.objects}
         self.root, self.context = scene.context()
         self._port = plant.get_geometry_query_input_port()
         self._plant = plant
@@ -179,11 +186,12 @@ class RobotWorld:
     def first_hit(self, rows: np.ndarray, contact: str | None = None, slot: str | None = None) -> int:
         """Index of the first row in collision, or -1.  `contact`: a body that the slot may touch."""
         plant, context, port = self._plant, self.context, self._port
+        lenient = contact is not None or self.tolerance > 0
         for i, row in enumerate(rows):
             plant.SetPositions(context, row)
             self.counts.collision_checks += 1
             query = port.Eval(context)
-            if query.HasCollisions() and not (contact and self._only_touching(query, contact, slot)):
+            if query.HasCollisions() and not (lenient and self._tolerated(query, contact, slot)):
                 return i
         return -1
 
@@ -191,19 +199,20 @@ class RobotWorld:
         """Which rows are in collision (N,)."""
         return np.array([self.first_hit(row[None]) == 0 for row in rows], dtype=bool)
 
-    def _only_touching(self, query: QueryObject, contact: str, slot: str | None) -> bool:
-        for pair in query.ComputePointPairPenetration():
-            names = {self._owner[pair.id_A], self._owner[pair.id_B]}
-            if names != {contact, slot} or pair.depth > CONTACT_DEPTH:
-                return False
-        return True
+    def _tolerated(self, query: QueryObject, contact: str | None, slot: str | None) -> bool:
+        depths = [depth for _, _, depth in self._penetrations(query, contact, slot)]
+        return not depths or sum(depths) <= self.tolerance
+
+    def _penetrations(self, query: QueryObject, contact: str | None, slot: str | None) -> list[tuple[str, str, float]]:
+        """The two owners and the depth (m) of every collision that is no touch of the slot and its contact."""
+        pairs = query.ComputePointPairPenetration()
+        found = [(self._owner[p.id_A], self._owner[p.id_B], p.depth) for p in pairs]
+        return [(a, b, d) for a, b, d in found if not ({a, b} == {contact, slot} and d <= CONTACT_DEPTH)]
 
     def culprits(self, row: np.ndarray, contact: str | None = None, slot: str | None = None) -> list[tuple[str, str]]:
         """Names of the two owners (robot, static body, object or slot) of every collision at one row."""
         self._plant.SetPositions(self.context, row)
-        pairs = self._port.Eval(self.context).ComputePointPairPenetration()
-        found = [(self._owner[p.id_A], self._owner[p.id_B], p.depth) for p in pairs]
-        return [(a, b) for a, b, d in found if not ({a, b} == {contact, slot} and d <= CONTACT_DEPTH)]
+        return [(a, b) for a, b, _ in self._penetrations(self._port.Eval(self.context), contact, slot)]
 
 
 class RobotPair:
@@ -212,7 +221,8 @@ class RobotPair:
     def __init__(self, problem: Problem, a: RobotWorld, b: RobotWorld, counts: Counts) -> None:
         self.counts = counts
         self.worlds = (a, b)
-        slots = (_slots(problem, a.name), _slots(problem, b.name))
+        self.tolerance = problem.collision.tolerance
+        slots, self.slot_of = zip(*(_slots(problem, world.name) for world in self.worlds), strict=True)
         scene = build_scene(
             problem,
             robots=[a.name, b.name],
@@ -226,7 +236,6 @@ class RobotPair:
             bodies = robot_bodies(plant, scene.robots[world.name]) + [b for s in own for b in scene.free_bodies[s]]
             # A robot's own collisions are judged in its own plant.
             manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(geometry_ids(plant, bodies))))
-        self.slot_of = [{o.name: f"{w.name}:{shape_key(o)}" for o in problem.objects} for w in self.worlds]
         self.root, self.context = scene.context()
         self._plant, self._port = plant, plant.get_geometry_query_input_port()
         template = plant.GetPositions(self.context)
@@ -243,10 +252,12 @@ class RobotPair:
         qb: np.ndarray,
         held_b: Attachment | None,
         widths: tuple[float | None, float | None] = (None, None),
+        exact: np.ndarray | None = None,
     ) -> int:
         """Index of the first pair of rows of qa (N, na), qb (N, nb) in collision, or -1.
 
-        `widths` are the openings (m) of hands that hold nothing; None: fully open.
+        `widths` are the openings (m) of hands that hold nothing; None: fully open.  `exact` (N,) says at which rows the
+        robots may stand: there the shapes count as they are, without padding, which is for motion between samples.
         """
         rows = np.repeat(self._template[None], len(qa), axis=0)
         for i, (q, held) in enumerate(((qa, held_a), (qb, held_b))):
@@ -256,12 +267,22 @@ class RobotPair:
             if held is not None:
                 write_held(self.scene, rows, self.slot_of[i][held.object], self.worlds[i].tool, q, held)
         plant, context, port = self._plant, self.context, self._port
+        lenient = self.tolerance > 0
         for i, row in enumerate(rows):
             plant.SetPositions(context, row)
             self.counts.collision_checks += 1
-            if port.Eval(context).HasCollisions():
+            query = port.Eval(context)
+            if query.HasCollisions() and not ((lenient or (exact is not None and exact[i])) and self._tolerated(query)):
                 return i
         return -1
+
+    def _tolerated(self, query: QueryObject) -> bool:
+        """Whether the shapes as they are penetrate no more than is tolerated."""
+        grown, total = self.scene.grown, 0.0
+        for p in query.ComputePointPairPenetration():
+            depth = p.depth - grown.get(p.id_A, 0.0) - grown.get(p.id_B, 0.0)
+            total += max(depth, 0.0)
+        return total <= self.tolerance
 
 
 def write_held(scene: Scene, rows: np.ndarray, slot: str, tool: Tool, q: np.ndarray, held: Attachment) -> None:

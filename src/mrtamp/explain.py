@@ -19,7 +19,8 @@ def explain(planner: Planner) -> str:
     nearest = min(modes, key=planner.guidance.remaining, default=None)
     if nearest is not None:
         waiting = [o.name for o in planner.problem.objects if not planner.guidance.done(nearest, o.name)]
-        where = ", ".join(f"{name} ({nearest.of[name].place})" for name in waiting)
+        waiting += [s.name for s in planner.problem.subgoals if s.name not in nearest.done]
+        where = ", ".join(f"{name} ({nearest.of[name].place})" if name in nearest.of else name for name in waiting)
         lines.append(
             f"Of {len(planner.graphs.modal)} modal states the nearest to the goal still lacks: {where or 'nothing'}"
         )
@@ -28,11 +29,14 @@ def explain(planner: Planner) -> str:
     wanted = {c.object for c in planner.problem.goal if hasattr(c, "object")}
     for item in sorted(wanted):
         lines += _object_lines(planner, item)
+    for key, outcome in planner.sampler.outcomes.items():
+        if key[0] == "reach" and not outcome.accepted:
+            lines.append(f"{_name(key)}: {_why(outcome)}")
     if planner.incumbent.refused:
         lines.append(
             f"The check refused {planner.incumbent.refused} plans, the last for {planner.incumbent.last_refusal}"
         )
-    trouble = [(count, robot, other) for (robot, other), count in planner.steering.trouble.items()]
+    trouble = [(count, robot, other) for (robot, other), count in planner.growth.steering.trouble.items()]
     if trouble:
         lines.append("Motions that failed, and what was in the way:")
         for count, robot, other in sorted(trouble, reverse=True)[:_MANY]:
@@ -59,6 +63,8 @@ def _object_lines(planner: Planner, item: str) -> list[str]:
 
 def _name(key: StratumKey) -> str:
     kind, robots, _, place = key
+    if kind == "reach":
+        return f"subgoal {place} by {' and '.join(robots)}"
     if kind == "handover":
         return f"handover from {robots[0]} to {robots[1]}"
     return f"{kind} by {robots[0]} {'from' if kind == 'pick' else 'on'} {place}"

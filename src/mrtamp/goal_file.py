@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform
 
 from mrtamp.model_files import model_facts
 from mrtamp.placement_file import BodyFrames, check_admits, check_rest, exact_support
-from mrtamp.problem import AtPose, Condition, HeldBy, InRegion, MovableObject, Robot, RobotAt, Support
+from mrtamp.problem import AtPose, Condition, HeldBy, InRegion, MovableObject, Robot, RobotAt, Subgoal, Support
 from mrtamp.reading import Value, choices
 from mrtamp.robot_file import read_configuration
 
@@ -17,12 +17,14 @@ from mrtamp.robot_file import read_configuration
 def read_goal(
     value: Value,
     robots: tuple[Robot, ...],
-    objects: list[MovableObject],
+    subgoals: tuple[Subgoal, ...],
     supports: list[Support],
     frames: BodyFrames,
 ) -> tuple[tuple[Condition, ...], list[Support]]:
     """The conditions of `goal:` and the supports they synthesise."""
-    reader = _GoalReader({r.name: r for r in robots}, frames, {s.name: s for s in supports if " " not in s.name})
+    attached = {(s.attach.object, s.attach.parent) for s in subgoals if s.attach is not None}
+    regions = {s.name: s for s in supports if " " not in s.name}
+    reader = _GoalReader({r.name: r for r in robots}, frames, regions, attached)
     items = value.items()
     if not items:
         raise value.wrong("at least one condition, such as {object: NAME, in: REGION}")
@@ -34,10 +36,17 @@ def read_goal(
 class _GoalReader:
     """Reads conditions one by one, remembering what is already decided: each object and robot may end in one place."""
 
-    def __init__(self, robots: dict[str, Robot], frames: BodyFrames, regions: dict[str, Support]) -> None:
+    def __init__(
+        self,
+        robots: dict[str, Robot],
+        frames: BodyFrames,
+        regions: dict[str, Support],
+        attached: set[tuple[str, str]],
+    ) -> None:
         self.robots = robots
         self.frames = frames
         self.regions = regions
+        self.attached = attached  # what subgoals move needs no grasps, and where they attach it no gripper
         self.supports: list[Support] = []
         self._ends: dict[str, tuple[Value, str]] = {}  # object -> (its condition, the body it ends on)
         self._taken: dict[str, Value] = {}
@@ -62,7 +71,7 @@ class _GoalReader:
         entries = value.mapping(("object",), ("in", "at", "on", "X_BO", "held_by"))
         thing = self.frames.objects[entries["object"].choice(self.frames.objects, "objects")]
         self._take(entries["object"], f"a goal for the object {thing.name!r}")
-        if not thing.grasps:
+        if not thing.grasps and all(name != thing.name for name, _ in self.attached):
             raise entries["object"].error(
                 f"found {thing.name!r}, which has no grasps, expected 'grasps:' on an object with a goal"
             )
@@ -108,7 +117,7 @@ class _GoalReader:
 
     def _held(self, value: Value, thing: MovableObject) -> HeldBy:
         robot = value.choice(self.robots, "robots")
-        if self.robots[robot].model.gripper is None:
+        if self.robots[robot].model.gripper is None and (thing.name, robot) not in self.attached:
             able = [name for name, r in self.robots.items() if r.model.gripper]
             raise value.error(f"found {robot!r}, which has no gripper, {choices(able, None, 'robots with a gripper')}")
         self._take(value, f"an object held by {robot!r}")

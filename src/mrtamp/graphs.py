@@ -1,10 +1,13 @@
 """The modal graph G_M and the orbital graph G_O as networkx graphs that a reader can print (paper, section V).
 
 An orbit is what connectivity has been *proved*: a component of a mode's explored tensor nodes.  Two entries into one
-mode are two orbits until a validated motion joins them.
+mode are two orbits until a validated motion joins them, and an orbit falls apart when a motion that held it together
+turns out invalid.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
 
 import networkx as nx
 
@@ -70,6 +73,20 @@ class Graphs:
         self.orbital.remove_node(b)
         self.orbits_of[state].remove(b)
         return a
+
+    def split(self, orbit: int, parts: int) -> list[int]:
+        """Make `parts` new orbits out of what was proved to be one; `orbit` stays as the rest of it.
+
+        Edges remain with `orbit` until `recount` says whose they are.
+        """
+        return [self.add_orbit(self.mode(orbit)) for _ in range(parts)]
+
+    def recount(self, orbits: Iterable[int], counts: Mapping[tuple[int, int], int]) -> None:
+        """Replace all edges at `orbits` by the transitions (source orbit, target orbit) -> number."""
+        for orbit in orbits:
+            self.orbital.remove_edges_from([*self.orbital.in_edges(orbit), *self.orbital.out_edges(orbit)])
+        for (a, b), count in counts.items():
+            self.orbital.add_edge(a, b, count=count)
 
     def transition(self, a: int, b: int) -> None:
         """Note a feasible transition from orbit a to orbit b."""

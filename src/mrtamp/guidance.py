@@ -15,7 +15,7 @@ import numpy as np
 
 from mrtamp.graphs import Graphs
 from mrtamp.modes import Mode, condition_holds
-from mrtamp.problem import AtPose, HeldBy, Problem, RobotAt
+from mrtamp.problem import AtPose, HeldBy, Problem, RobotAt, Subgoal
 from mrtamp.transitions.candidate import StratumKey
 from mrtamp.transitions.sampler import TransitionSampler
 
@@ -61,6 +61,7 @@ class ModalGuidance:
         self.robots = [r.name for r in problem.robots if r.model.gripper is not None]
         self._static = sampler.validity.X_WB
         self._conditions = {c.object: c for c in problem.goal if not isinstance(c, RobotAt)}
+        self._led = {s.attach.object for s in problem.subgoals if s.attach is not None}
         self._supports = {
             o.name: [s for s in problem.supports if s.body != o.name and (s.objects is None or o.name in s.objects)]
             for o in problem.objects
@@ -150,11 +151,14 @@ class ModalGuidance:
 
     def remaining(self, mode: Mode) -> float:
         """Optimistic cost of the transitions from `mode` to a goal mode: their number, and what failures say."""
-        return sum(self._remaining(mode, item) for item in mode.of)
+        return self._subgoals_left(mode) + sum(self._remaining(mode, item) for item in mode.of)
+
+    def _subgoals_left(self, mode: Mode) -> int:
+        return len(self.problem.subgoals) - len(mode.done)
 
     def transitions_to_go(self, mode: Mode) -> int:
         """Number of transitions on the paths that `remaining` is the cost of."""
-        return sum(self._transitions_to_go(mode, item) for item in mode.of)
+        return self._subgoals_left(mode) + sum(self._transitions_to_go(mode, item) for item in mode.of)
 
     def _transitions_to_go(self, mode: Mode, item: str) -> int:
         if self.done(mode, item):
@@ -166,6 +170,9 @@ class ModalGuidance:
         a = mode.of[item]
         condition = self._conditions.get(item)
         if self.done(mode, item):
+            return 0.0
+        if condition is None and item in self._led and self._subgoals_left(mode):
+            # Subgoals say what becomes of it.
             return 0.0
         if condition is None:
             # Without a goal of its own, it only has to be put down, or taken off what it rests on.
@@ -190,9 +197,10 @@ class ModalGuidance:
 
     def _discouragement(self, mode: Mode, choice: Choice) -> float:
         """What speaks against a choice: failures, here and in modes alike but for poses, and where it leads."""
-        item, end = choice.object, _ends(choice)[1]
-        there = tuple((o, end if o == item else place) for o, place in mode.state)
-        visits = self._graphs.visits(there)
+        visits = 0
+        if choice.kind != "reach":
+            item, end = choice.object, _ends(choice)[1]
+            visits = self._graphs.visits(tuple((o, end if o == item else place) for o, place in mode.state))
         return (
             FAILED_TRY * self.failed(mode, choice)
             + min(FAILED_STATE * self._failures[mode.state, choice], FAILED_STATES)
@@ -217,7 +225,8 @@ class ModalGuidance:
                     if body in mode.of and mode.of[body].held:
                         continue
                 out.append(choice)
-        return out
+        reach = self.sampler.reaching
+        return out + [reach_choice(s) for s in self.problem.subgoals if reach.enabled(mode, s)]
 
     def proposals(self, mode: Mode) -> list[tuple[float, Choice]]:
         """Enabled transitions and how much dearer than the best path each is by the estimate, lowest first."""
@@ -228,6 +237,9 @@ class ModalGuidance:
         reserved = self._reserved(mode)
         for choice in enabled:
             item = choice.object
+            if choice.kind == "reach":
+                out.append((self._discouragement(mode, choice), choice))
+                continue
             start, end = _ends(choice)
             if self.done(mode, item) and item not in blockers:
                 continue
@@ -315,8 +327,16 @@ class ModalGuidance:
 
     def _touched(self, mode: Mode, choice: Choice) -> set[str]:
         """Objects that a transition is about: what it moves, and what that is put on."""
+        if choice.kind == "reach":
+            attach = self.problem.subgoal(choice.place).attach
+            return {attach.object, attach.parent} & set(mode.of) if attach else set()
         body = self.problem.support(choice.place).body if choice.kind == "place" else choice.object
         return {choice.object, body} & set(mode.of)
+
+
+def reach_choice(subgoal: Subgoal) -> Choice:
+    """The transition that reaches a subgoal."""
+    return Choice("reach", tuple(subgoal.targets), subgoal.attach.object if subgoal.attach else "", subgoal.name)
 
 
 def _ends(choice: Choice) -> tuple[str, str]:

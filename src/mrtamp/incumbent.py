@@ -32,6 +32,11 @@ class Incumbent:
         plan.history = [{"time_s": 0.0, "cost": cost}]
         return plan
 
+    def accepted(self, segments: list[Segment], transitions: list[Transition]) -> Plan | None:
+        """A plan with its cost if the judge accepts it, else None."""
+        plan = self.plan(segments, transitions)
+        return plan if self.judge(plan).ok else None
+
     def judge(self, plan: Plan) -> Report:
         """The independent judge's report."""
         report = self._checker.check(plan)

@@ -5,12 +5,15 @@
      "attachments": [{"id": 0, "object": "red", "parent": "table", "support": "on_it",
                       "X_PO": [x, y, z, qw, qx, qy, qz]},
                      {"id": 1, "object": "red", "parent": "left", "width": 0.05, "X_PO": [...]}],
-     "segments": [{"mode": {"red": 0}, "q": {"left": [[...], ...]}}, ...],
+     "segments": [{"mode": {"red": 0}, "q": {"left": [[...], ...]}}, ..., {"mode": {"red": 1}, "done": ["top"], ...}],
      "transitions": [{"kind": "pick", "active": ["left"],
-                      "actions": [{"kind": "pick", "robots": ["left"], "object": "red", "before": 0, "after": 1}]}]}
+                      "actions": [{"kind": "pick", "robots": ["left"], "object": "red", "before": 0, "after": 1}]},
+                     {"kind": "reach", "active": ["left"],
+                      "actions": [{"kind": "reach", "robots": ["left"], "object": null, "before": null, "after": null,
+                                   "subgoal": "top"}]}]}
 
-Attachments are listed once and referred to by id, because their identity is what makes two modes equal.  The format is
-described in full by `models/schema/plan.schema.json`.
+Attachments are listed once and referred to by id, because their identity is what makes two modes equal; `done` lists
+the subgoals reached, where there are any.  The format is described in full by `models/schema/plan.schema.json`.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ from mrtamp.problem_file import problem_from_dict, problem_to_dict
 from mrtamp.reading import Document, Value, data_document
 
 PLAN_VERSION = 1
-KINDS = ("pick", "place", "handover")
+KINDS = ("pick", "place", "handover", "reach")
 
 
 class PlanError(MrtampError):
@@ -103,6 +106,7 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
     segments = [
         {
             "mode": {a.object: number(a) for a in segment.mode.attachments},
+            **({"done": sorted(segment.mode.done)} if segment.mode.done else {}),
             "q": {name: np.asarray(q, dtype=float).tolist() for name, q in segment.q.items()},
         }
         for segment in plan.segments
@@ -116,8 +120,9 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
                     "kind": action.kind,
                     "robots": list(action.robots),
                     "object": action.object,
-                    "before": number(action.before),
-                    "after": number(action.after),
+                    "before": number(action.before) if action.before is not None else None,
+                    "after": number(action.after) if action.after is not None else None,
+                    **({"subgoal": action.subgoal} if action.subgoal is not None else {}),
                 }
                 for action in transition.actions
             ],
@@ -247,9 +252,13 @@ def _attachments(value: Value, problem: Problem) -> dict[int, Attachment]:
 
 
 def _segment(value: Value, problem: Problem, attachments: dict[int, Attachment]) -> Segment:
-    entries = value.mapping(("mode", "q"))
+    entries = value.mapping(("mode", "q"), ("done",))
     of = entries["mode"].mapping(tuple(o.name for o in problem.objects))
-    mode = Mode(tuple(_attachment(of[o.name], o.name, attachments) for o in problem.objects))
+    names = [s.name for s in problem.subgoals]
+    done = [item.choice(names, "subgoals") for item in entries["done"].items()] if "done" in entries else []
+    if len(set(done)) != len(done):
+        raise entries["done"].wrong("each subgoal once")
+    mode = Mode(tuple(_attachment(of[o.name], o.name, attachments) for o in problem.objects), frozenset(done))
     q = entries["q"].mapping(tuple(r.name for r in problem.robots))
     waypoints = {r.name: _waypoints(q[r.name], len(r.model.arm_joints)) for r in problem.robots}
     lengths = {name: len(rows) for name, rows in waypoints.items()}
@@ -286,14 +295,29 @@ def _transition(value: Value, problem: Problem, attachments: dict[int, Attachmen
 
 
 def _action(value: Value, problem: Problem, attachments: dict[int, Attachment]) -> Action:
-    entries = value.mapping(("kind", "robots", "object", "before", "after"))
-    name = entries["object"].choice([o.name for o in problem.objects], "objects")
+    entries = value.mapping(("kind", "robots", "object", "before", "after"), ("subgoal",))
+    kind = entries["kind"].choice(KINDS, "kinds of actions")
     robots = [r.name for r in problem.robots]
+    before = after = subgoal = None
+    if kind == "reach":
+        if "subgoal" not in entries:
+            raise value.error("found no key 'subgoal', expected the subgoal that is reached")
+        subgoal = entries["subgoal"].choice([s.name for s in problem.subgoals], "subgoals")
+    elif entries.get("subgoal") is not None and entries["subgoal"].data is not None:
+        raise entries["subgoal"].wrong(f"none: a {kind} reaches no subgoal")
+    if kind != "reach" or entries["object"].data is not None:
+        name = entries["object"].choice([o.name for o in problem.objects], "objects")
+        before, after = (_attachment(entries[key], name, attachments) for key in ("before", "after"))
+    else:
+        for key in ("before", "after"):
+            if entries[key].data is not None:
+                raise entries[key].wrong("null, as no object changes")
     return Action(
-        kind=entries["kind"].choice(KINDS, "kinds of actions"),
+        kind=kind,
         robots=tuple(item.choice(robots, "robots") for item in entries["robots"].items()),
-        before=_attachment(entries["before"], name, attachments),
-        after=_attachment(entries["after"], name, attachments),
+        before=before,
+        after=after,
+        subgoal=subgoal,
     )
 
 

@@ -11,21 +11,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mrtamp.check import Report
-from mrtamp.check_report import Violation
 from mrtamp.collision import Collision, Counts
+from mrtamp.coordination import coordinate
+from mrtamp.effort import Effort
 from mrtamp.explain import explain
-from mrtamp.graphs import Graphs
+from mrtamp.growth import Growth
 from mrtamp.guidance import Choice, ModalGuidance
 from mrtamp.incumbent import Incumbent
-from mrtamp.modes import Mode, goal_mode, start_mode
-from mrtamp.plan import Plan, Transition, without_detours
+from mrtamp.modes import Mode, start_mode
+from mrtamp.plan import Plan, Transition
 from mrtamp.portfolio import Portfolio
-from mrtamp.problem import MrtampError, Problem, RobotAt
-from mrtamp.refine import Refiner
+from mrtamp.problem import MrtampError, Problem
 from mrtamp.roadmap import Roadmap
-from mrtamp.steering import Steering
-from mrtamp.tensor_tree import At, Node, TensorTree
+from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
+from mrtamp.tensor_tree import Node
 from mrtamp.transitions.candidate import Candidate
 from mrtamp.transitions.projection import uniform_configurations
 from mrtamp.transitions.sampler import TransitionSampler
@@ -37,8 +36,29 @@ _PATIENCE = 4
 """Failures of a transition in a mode after which guidance no longer insists on promising candidates."""
 
 
+_SKELETON_TURN = 4
+"""Before the first plan, every so many iterations skeletons have their turn."""
+_FIRST_WAYS, _MORE_WAYS = (40, 14), (64, 20)
+"""IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
+_REALISATIONS = 6
+"""Skeletons that are tried at a time."""
+_HOPE = 1.0
+"""Skeletons are realised while their estimate is less than the incumbent's cost times this."""
 _TIE = 0.25
 """Difference of optimistic estimates within which guidance chooses at random."""
+
+
+MECHANISMS = {
+    "modal-guidance": "optimistic modal guidance before the first plan; without it orbits and transitions are random",
+    "orbit-path-guidance": "after the first plan, half of the search works along the incumbent's orbits",
+    "skeletons": "guidance that knows costs: whole skeletons from decoupled distances",
+    "coordination": "motions of a new plan begin as early as the others allow",
+    "refinement": "optimisation of plans once there are some",
+    "convex-programming": "the second half of refinement; without it plans are only shortened robot by robot",
+    "sliding": "transitions move along their strata in refinement",
+    "adoption": "refined configurations go back into the roadmaps and the tree",
+}
+"""Mechanisms that can be switched off by name, for ablation."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +70,8 @@ class Options:
     iteration.
     extensions : candidates the tree is extended to per iteration.
     persistent : share of iterations that ignore guidance, for ever.
-    refinements : proposals of refinement per iteration, once there is a plan; 0 leaves the tree's plans as they are.
+    refinement_share : largest share of the time after the first plan that refinement may take.
+    without : names of mechanisms (see `MECHANISMS`) that are switched off.
     """
 
     initial_vertices: int = 40
@@ -58,7 +79,13 @@ class Options:
     transition_samples: int = 48
     extensions: int = 3
     persistent: float = 0.1
-    refinements: int = 60
+    refinement_share: float = 0.85
+    without: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        unknown = sorted(self.without - set(MECHANISMS))
+        if unknown:
+            raise MrtampError(f"without: unknown mechanism {', '.join(unknown)}; choose from {', '.join(MECHANISMS)}")
 
 
 @dataclass(frozen=True)
@@ -103,24 +130,36 @@ class Planner:
         self.names = list(self.roadmaps)
         self.validity = Validity(problem, self.collision, self.roadmaps)
         self.sampler = TransitionSampler(problem, self.collision, self.roadmaps, self.validity, self.rng)
-        self.graphs = Graphs()
+        self.growth = Growth(problem, self.roadmaps, self.validity, self.rng)
+        self.graphs, self.tree = self.growth.graphs, self.growth.tree
         self.guidance = ModalGuidance(problem, self.sampler, self.graphs)
-        self.tree = TensorTree(list(self.roadmaps.values()), problem.cost)
-        self.steering = Steering(list(self.roadmaps.values()), self.validity, self._insert, self.rng)
         self.iteration = 0
-        self._goal_vertices: dict[str, int] = {}
-        self._goal_nodes: list[Node] = []
         self._path: list[int] = []
         self._tree_cost = np.inf
-        self._solution: Node | None = None
-        self._banned: set[tuple] = set()
+        self._judged: set[int] = set()
         self.incumbent = Incumbent(problem, seed, self.counts)
-        self._portfolio = Portfolio(
-            self._refiner,
-            lambda refiner: self.incumbent.plan(refiner.segments(), refiner.transitions),
-            lambda plan: self.incumbent.judge(plan).ok,
+        self.incumbent.check_start()
+        mode = start_mode(problem)
+        self.sampler.remember(mode)
+        self.root = self.growth.start(mode)
+        for robot in problem.robots:
+            self._add_interior(robot.name, self.options.initial_vertices)
+        self.skeletons = SkeletonGuidance(problem, self.sampler, self.guidance, mode)
+        self.portfolio = Portfolio(
+            problem,
+            self.collision,
+            self.validity,
+            self.roadmaps,
+            self.sampler,
+            self.incumbent,
+            self.rng,
+            convex=self._uses("convex-programming"),
+            sliding=self._uses("sliding"),
         )
-        self._start()
+        self._effort = Effort(
+            {"search": 0.05, "skeletons": 0.1, "refinement": 0.1}, {"refinement": self.options.refinement_share}
+        )
+        self._timed = True
         self._spent = time.perf_counter() - self._clock
 
     @property
@@ -149,28 +188,53 @@ class Planner:
         self._clock = time.perf_counter() - self._spent
         end = np.inf if budget_s is None else time.perf_counter() + budget_s
         stop = np.inf if iterations is None else self.iteration + iterations
+        self._timed = iterations is None
         try:
             while time.perf_counter() < end and self.iteration < stop:
-                orbit, choices = self._guide()
-                self._expand_roadmaps(orbit)
-                candidates = self._sample_transitions(orbit, choices)
-                for combination in candidates:
-                    self._discover_adjacent_orbit(orbit, combination)
-                self._extend_tree(orbit, choices, candidates)
+                activity = self._next_activity()
+                began, before = time.perf_counter(), self._cost()
+                better = {"search": self._search, "skeletons": self._realise_skeletons, "refinement": self._refine}[
+                    activity
+                ]()
                 self.iteration += 1
-                found = self._best_solution()
+                work = time.perf_counter() - began if self._timed else 1.0
+                if np.isfinite(before):
+                    self._effort.record(activity, work, before - self._cost())
                 self._spent = self._elapsed()
                 if progress is not None:
                     progress(self.status())
-                if found:
+                if better:
                     yield self._incumbent()
                     if first:
                         return
-                    self._drop_detours()
-                if self.best is not None and self._refine():
-                    yield self._incumbent()
         finally:
             self._spent = self._elapsed()
+
+    def _search(self) -> bool:
+        """One iteration of the algorithm's loop; whether there is a better plan."""
+        orbit, choices = self._guide()
+        self._expand_roadmaps(orbit)
+        candidates = self._sample_transitions(orbit, choices)
+        for combination in candidates:
+            self._discover_adjacent_orbit(orbit, combination)
+        self._extend_tree(orbit, choices, candidates)
+        return self._best_solution()
+
+    def _next_activity(self) -> str:
+        """Before the first plan search and skeletons in turn; then what is behind its share."""
+        refine, skeletons = self._uses("refinement"), self._uses("skeletons") and self.skeletons.applies
+        if self.best is None:
+            return "skeletons" if skeletons and self.iteration % _SKELETON_TURN == 0 else "search"
+        activity = self._effort.next()
+        if (activity == "refinement" and not refine) or (activity == "skeletons" and not skeletons):
+            return "search"
+        return activity
+
+    def _uses(self, mechanism: str) -> bool:
+        return mechanism not in self.options.without
+
+    def _cost(self) -> float:
+        return self.best.cost if self.best is not None else np.inf
 
     def _incumbent(self) -> Plan:
         assert self.best is not None
@@ -180,44 +244,24 @@ class Planner:
         """Seconds spent planning, over all calls."""
         return time.perf_counter() - self._clock
 
-    # -- initialisation -------------------------------------------------------------------------------------------
-
-    def _start(self) -> None:
-        self.incumbent.check_start()
-        mode = start_mode(self.problem)
-        self.sampler.remember(mode)
-        at = []
-        for robot in self.problem.robots:
-            roadmap = self.roadmaps[robot.name]
-            at.append(roadmap.add_vertex(robot.start))
-            if np.max(np.abs(robot.home - robot.start)) > 0:
-                roadmap.add_vertex(robot.home)
-            for condition in self.problem.goal:
-                if isinstance(condition, RobotAt) and condition.robot == robot.name:
-                    same = np.flatnonzero(np.max(np.abs(roadmap.q - condition.q), axis=1) == 0)
-                    self._goal_vertices[robot.name] = int(same[0]) if len(same) else roadmap.add_vertex(condition.q)
-        for robot in self.problem.robots:
-            self._add_interior(robot.name, self.options.initial_vertices)
-        root_orbit = self.graphs.add_orbit(mode)
-        self.root = self.tree.add_root(mode, tuple(at), root_orbit)
-        self._note_goal(self.root)
-
     # -- guidance -------------------------------------------------------------------------------------------------
 
     def _guide(self) -> tuple[int, list[Choice]]:
         """Orbit to work in and the elementary transitions Gamma to sample there (one per robot, disjoint)."""
         explore = self.rng.random() < self.options.persistent
-        if explore:
+        along = self.best is not None and self._uses("orbit-path-guidance") and self.rng.random() < 0.5
+        modal = self._uses("modal-guidance")
+        if explore or not (along or modal):
             orbits = [o for o in self.graphs.orbital.nodes if self.tree.of_orbit.get(o)] or [0]
             orbit = orbits[int(self.rng.integers(len(orbits)))]
-        elif self.best is not None:
+        elif along:
             orbit = self._orbit_path_guidance()
         else:
             orbit = self._modal_frontier()
         self.graphs.orbital.nodes[orbit]["visits"] += 1
         mode = self.graphs.mode(orbit)
         self.graphs.modal.nodes[mode.state]["visits"] += 1
-        if explore:
+        if explore or not modal:
             return orbit, self.guidance.feasible_sets(mode, self.rng)
         return orbit, self._optimistic_choices(mode)
 
@@ -292,7 +336,7 @@ class Planner:
             guided = len(choices) == 1 and failed < _PATIENCE
             known = self._known(mode, choice)
             if guided:
-                known = [c for c in known if c.promising and not self._taken(mode, c)]
+                known = [c for c in known if c.promising and not (self.best is None and self.growth.taken(mode, c))]
             # Grow the set while it is small, later in step with its logarithm, for ever.
             if len(known) < 4 or self.best is not None or self.rng.random() < 0.3 + self.options.persistent:
                 known = [*(c for c in self._sample(mode, choice) if c.promising or not guided), *known]
@@ -312,15 +356,13 @@ class Planner:
                 out.append(pick)
         return out
 
-    def _taken(self, mode: Mode, candidate: Candidate) -> bool:
-        """Whether the tree already has the mode that a candidate leads to, and there is no plan to improve yet."""
-        return self.best is None and self.tree.entry(mode.replace(candidate.after)) is not None
-
     def _low_index(self, n: int) -> int:
         """An index below n, earlier ones more likely."""
         return int(min(n - 1, self.rng.geometric(0.35) - 1))
 
     def _known(self, mode: Mode, choice: Choice) -> list[Candidate]:
+        if choice.kind == "reach":
+            return self.sampler.reaching.known(mode, self.problem.subgoal(choice.place))
         if choice.kind == "pick":
             return self.sampler.picks(mode, choice.robots[0], choice.object)
         if choice.kind == "place":
@@ -329,6 +371,8 @@ class Planner:
 
     def _sample(self, mode: Mode, choice: Choice) -> list[Candidate]:
         n = self.options.transition_samples
+        if choice.kind == "reach":
+            return self.sampler.reaching.sample(mode, self.problem.subgoal(choice.place), n)
         if choice.kind == "pick":
             return self.sampler.sample_pick(mode, choice.robots[0], choice.object, n)
         if choice.kind == "place":
@@ -339,7 +383,7 @@ class Planner:
     def _discover_adjacent_orbit(self, orbit: int, combination: tuple[Candidate, ...]) -> None:
         """Note the modal state that a sampled transition leads to."""
         mode = self.graphs.mode(orbit)
-        self.graphs.discover(mode.replace(*(c.after for c in combination)).state, mode.state)
+        self.graphs.discover(_after(mode, combination).state, mode.state)
 
     # -- tree -----------------------------------------------------------------------------------------------------
 
@@ -352,20 +396,21 @@ class Planner:
             near = self._select_tensor_node(orbit)
             if near is None:
                 return
-            if self._towards(near, combination):
+            if self.growth.towards(near, combination):
                 reached = True
                 if self.best is None:
                     break
         if candidates:
             for choice in choices:
                 self.guidance.record(mode, choice, reached)
-        if self._goal_mode(mode):
-            self._towards_goal(orbit)
+        near = self._select_tensor_node(orbit)
+        if near is not None and self.growth.goal_vertices and self.growth.is_goal_mode(mode):
+            self.growth.towards_goal(near)
         if self.rng.random() < self.options.persistent:
             node = self._select_tensor_node(orbit, uniform=True)
             for _ in range(4):
                 if node is not None:
-                    node = self.steering.random_step(node)
+                    node = self.growth.steering.random_step(node)
 
     def _select_tensor_node(self, orbit: int, uniform: bool = False) -> Node | None:
         """A node of the orbit: usually the one it was entered by at the least cost, else any."""
@@ -376,165 +421,68 @@ class Planner:
             return nodes[int(self.rng.integers(len(nodes)))]
         return min(nodes, key=lambda x: x.cost)
 
-    def _towards(self, near: Node, combination: tuple[Candidate, ...]) -> bool:
-        """Drive the active robots to their transition vertices and change the mode there."""
-        node = self._drive(near, combination)
-        return node is not None and self._change_mode(node, combination)
+    # -- skeletons ------------------------------------------------------------------------------------------------
 
-    def _drive(self, near: Node, combination: tuple[Candidate, ...]) -> Node | None:
-        """The node at which all active robots of a transition stand at their vertices."""
-        return self.steering.drive(near, {r: v for c in combination for r, v in c.at.items()})
-
-    def _change_mode(self, node: Node, combination: tuple[Candidate, ...]) -> bool:
-        mode = node.mode.replace(*(c.after for c in combination))
-        active = tuple(sorted({r for c in combination for r in c.robots}))
-        if (mode.key, node.at) in self._banned:
-            return False
-        if self.validity.stand(mode, dict(zip(self.names, node.at, strict=True)), active) is not None:
-            return False
-        cost = sum(self.problem.cost.transitions.get(c.kind, 0.0) for c in combination)
-        known = self.tree.find(mode, node.at)
-        if known is not None and known.cost <= node.cost + cost:
-            return False
-        orbit = self.graphs.add_orbit(mode) if known is None else None
-        transition = Transition(tuple(c.action for c in combination))
-        after = self.tree.insert_transition(node, transition, mode, orbit, cost)
-        self.graphs.transition(node.orbit, after.orbit)
-        self._note_goal(after)
-        return True
-
-    def _towards_goal(self, orbit: int) -> None:
-        """In a mode that satisfies the goal, bring the robots to where they have to end."""
-        near = self._select_tensor_node(orbit)
-        if near is None or not self._goal_vertices:
-            return
-        for name in [str(x) for x in self.rng.permutation(list(self._goal_vertices))]:
-            node = self.steering.drive(near, {name: self._goal_vertices[name]})
+    def _realise_skeletons(self) -> bool:
+        """Grow the sets of ways and realise the cheapest skeletons that may beat the incumbent, until one succeeds."""
+        first = self.best is None
+        self.skeletons.grow(*(_FIRST_WAYS if first else _MORE_WAYS))
+        for _ in range(_REALISATIONS):
+            proposal: Proposal | None = next(self.skeletons.propose(_HOPE * self._cost()), None)
+            if proposal is None:
+                return False
+            node = self.growth.realise(proposal, self.skeletons, self.root)
             if node is not None:
-                near = node
-        # Whoever was sent aside comes back at the end.
-        for name, v in self._goal_vertices.items():
-            node = self.steering.drive(near, {name: v}, depth=0)
-            near = node or near
-
-    def _insert(self, node: Node, at: At) -> Node:
-        """InsertAndRewire: a validated step; orbits that it proves connected become one."""
-        new, is_new = self.tree.insert(node, at)
-        if not is_new and new.orbit != node.orbit:
-            kept = self.graphs.merge(new.orbit, node.orbit)
-            self.tree.merge_orbits(kept, new.orbit if new.orbit != kept else node.orbit)
-        self.counts.nodes = len(self.tree.nodes)
-        if is_new:
-            self._note_goal(new)
-        return new
+                self.skeletons.realised(proposal)
+                return self._solution(node)
+        return False
 
     # -- solutions ------------------------------------------------------------------------------------------------
 
-    def _goal_mode(self, mode: Mode) -> bool:
-        return goal_mode(self.problem, mode, self.validity.X_WB)
-
-    def _note_goal(self, node: Node) -> None:
-        at = dict(zip(self.names, node.at, strict=True))
-        if all(at[r] == v for r, v in self._goal_vertices.items()) and self._goal_mode(node.mode):
-            self._goal_nodes.append(node)
-
     def _best_solution(self) -> bool:
-        """Extract the cheapest plan of the tree, have it checked, and keep it when it beats the incumbent."""
+        """Extract the cheapest plan of the tree when it beats what the tree gave before."""
         while True:
-            self._goal_nodes = [n for n in self._goal_nodes if n.alive]
-            node = min(self._goal_nodes, key=lambda n: n.cost, default=None)
+            growth = self.growth
+            growth.goal_nodes = [n for n in growth.goal_nodes if n.alive]
+            node = min(growth.goal_nodes, key=lambda n: n.cost, default=None)
             if node is None or node.cost >= self._tree_cost - 1e-9:
                 return False
-            segments, transitions, groups = self.tree.trace(node)
+            cost = node.cost
+            if self._solution(node):
+                self._tree_cost = cost
+                if node.alive:
+                    growth.without_detours(self.root, node)
+                return True
+            if node.alive:
+                self._tree_cost = cost
+
+    def _solution(self, node: Node) -> bool:
+        """Have a solution of the tree shortened and judged, and put it under refinement; whether it is the best yet."""
+        segments, transitions, groups = self.tree.trace(node)
+        plan = None
+        if self._uses("coordination"):
+            # Judged as a whole; what slips between its samples does not count against the tree's own steps.
+            timed = coordinate(segments, transitions, self.collision, self.validity)
+            plan = self.incumbent.accepted(timed, transitions)
+        if plan is None:
             plan = self.incumbent.plan(segments, transitions)
             report = self.incumbent.judge(plan)
-            if report.ok:
-                self._tree_cost = node.cost
-                self._path = [g[0].orbit for g in groups]
-                self._solution = node
-                if self.options.refinements:
-                    self._portfolio.add(plan)
-                return self.incumbent.offer(plan, self._elapsed())
-            self._repair(report, groups)
-            if node.alive:
-                self.tree.cut(node)
-
-    def _drop_detours(self) -> None:
-        """Extend the tree by the newest solution without the picks that were put back where they came from."""
-        assert self._solution is not None
-        steps = [x for x in self.tree.branch(self._solution) if x.transition is not None]
-        kept = without_detours([x.transition.actions for x in steps if x.transition is not None])
-        if len(kept) == len(steps):
-            return
-        at = self.root
-        for k in kept:
-            transition = steps[k].transition
-            assert transition is not None
-            vertices = dict(zip(self.names, steps[k].at, strict=True))
-            combination = tuple(
-                Candidate(a.kind, a.robots, {r: vertices[r] for r in a.robots}, a.before, a.after)
-                for a in transition.actions
-            )
-            there = self._drive(at, combination)
-            if there is None:
-                return
-            self._change_mode(there, combination)
-            after = self.tree.find(there.mode.replace(*(c.after for c in combination)), there.at)
-            if after is None:
-                return
-            at = after
-        if self._goal_vertices and self._goal_mode(at.mode):
-            self._towards_goal(at.orbit)
+            if not report.ok:
+                self.growth.repair(report, groups)
+                if node.alive:
+                    self.tree.cut(node)
+                return False
+        better = self.incumbent.offer(plan, self._elapsed())
+        if better:
+            self._path = [g[0].orbit for g in groups]
+        if self._uses("refinement"):
+            self.portfolio.add(plan)
+        return better
 
     def _refine(self) -> bool:
-        """A share of proposals to one of the plans under refinement; a checked gain is offered."""
-        assert self.best is not None
-        plan = self._portfolio.improve(self.options.refinements, self.best.cost)
+        """Give refinement its turn; whether there is a better plan."""
+        plan = self.portfolio.improve(self._cost())
         return plan is not None and self.incumbent.offer(plan, self._elapsed())
-
-    def _refiner(self, plan: Plan, resolution: float) -> Refiner:
-        return Refiner(
-            plan.segments,
-            plan.transitions,
-            self.problem.cost,
-            self.collision,
-            self.validity,
-            self.roadmaps,
-            self.rng,
-            resolution,
-        )
-
-    def _repair(self, report: Report, groups: list[list[Node]]) -> None:
-        """The judge found what samples had missed: forbid that step, or that change of mode, and cut the tree there."""
-        for violation in report.violations:
-            if violation.kind not in ("collision", "contact") or violation.segment is None:
-                raise MrtampError(f"the planner produced an illegal plan; please report this: {violation}")
-            group = groups[violation.segment]
-            step = violation.step or 0
-            at_end = step >= len(group) - 2 and (violation.fraction or 0.0) > 0.999
-            if at_end and violation.segment + 1 < len(groups):
-                # Fingers that close or open at the transition may be the cause.
-                after = groups[violation.segment + 1][0]
-                self._banned.add((after.mode.key, after.at))
-                if after.alive:
-                    self.tree.cut(after)
-            if step + 1 < len(group):
-                before, after = group[step], group[step + 1]
-                guilty, obstacle = self._guilty(violation, before)
-                one, two = (dict(zip(self.names, x.at, strict=True)) for x in (before, after))
-                self.validity.forbid(before.mode, one, two, guilty, obstacle)
-                if after.alive:
-                    self.tree.cut(after)
-
-    def _guilty(self, violation: Violation, node: Node) -> tuple[tuple[str, ...], str | None]:
-        """The one or two robots that a violation is about, counting loads with their carriers, and what one hit."""
-        carriers = {a.object: r for r, a in node.mode.held.items()}
-        owners = [carriers.get(s.owner, s.owner) for s in violation.sides or ()]
-        robots = tuple(dict.fromkeys(o for o in owners if o in self.roadmaps))
-        obstacles = [o for o in owners if o not in self.roadmaps]
-        if robots and violation.kind == "collision":
-            return robots, obstacles[0] if obstacles else robots[0]
-        return robots or tuple(self.names[:1]), None
 
     # -- reports --------------------------------------------------------------------------------------------------
 
@@ -562,3 +510,8 @@ class Planner:
     def explain(self) -> str:
         """Why there is no plan yet: per stratum what was tried and what stopped it, and who blocked whose motion."""
         return explain(self)
+
+
+def _after(mode: Mode, combination: tuple[Candidate, ...]) -> Mode:
+    """The mode to which a simultaneous transition leads."""
+    return mode.after(Transition(tuple(c.action for c in combination)))

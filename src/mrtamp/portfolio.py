@@ -2,66 +2,115 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
-from mrtamp.collision import RESOLUTION
+import numpy as np
+
+from mrtamp.collision import RESOLUTION, Collision
+from mrtamp.incumbent import Incumbent
 from mrtamp.plan import Plan
+from mrtamp.problem import Problem
 from mrtamp.refine import Refiner
+from mrtamp.roadmap import Roadmap
+from mrtamp.transitions.sampler import TransitionSampler
+from mrtamp.validity import Validity
 
-SIZE = 3
-CHANCE = 600
-"""Proposals after which plans are compared by cost."""
-WORTH_CHECKING = 0.005
+SIZE = 4
+_SLICE = 60
+"""Proposals of shortening per turn."""
+_SHORTENING = 480
+"""Proposals after which shortening ends at the latest."""
+_STALE = 0.004
+"""Relative gain of a turn below which shortening has done its part."""
+WORTH_CHECKING = 0.003
 """Relative gain over the incumbent that is worth a check."""
 
 
-@dataclass
-class _Candidate:
-    refiner: Refiner
-    checked: Plan
-    resolution: float
+@dataclass(eq=False)
+class _Entry:
+    """A checked plan and what works on it."""
+
+    plan: Plan
+    resolution: float = RESOLUTION
+    refiner: Refiner | None = None
+    proposals: int = 0
+    done: bool = False
+    costs: list[float] = field(default_factory=list)
+
+    @property
+    def cost(self) -> float:
+        return self.refiner.cost if self.refiner is not None else self.plan.cost
 
 
 class Portfolio:
-    """Up to SIZE refiners that take turns.
-
-    Parameters
-    ----------
-    make : a refiner for a plan at a sampling resolution (m).
-    assemble : turns a refiner's polyline into a plan.
-    accept : whether the judge accepts a plan.
-    """
+    """Up to SIZE plans that take turns: the newest are shortened first, then the cheapest is optimised on."""
 
     def __init__(
         self,
-        make: Callable[[Plan, float], Refiner],
-        assemble: Callable[[Refiner], Plan],
-        accept: Callable[[Plan], bool],
+        problem: Problem,
+        collision: Collision,
+        validity: Validity,
+        roadmaps: Mapping[str, Roadmap],
+        sampler: TransitionSampler,
+        incumbent: Incumbent,
+        rng: np.random.Generator,
+        *,
+        convex: bool = True,
+        sliding: bool = True,
     ) -> None:
-        self._make, self._assemble, self._accept = make, assemble, accept
-        self._candidates: list[_Candidate] = []
+        self.problem = problem
+        self.collision = collision
+        self.validity = validity
+        self.roadmaps = roadmaps
+        self.sampler = sampler
+        self.incumbent = incumbent
+        self.rng = rng
+        self.convex = convex
+        self.sliding = sliding
+        self._entries: list[_Entry] = []
 
-    def add(self, plan: Plan, resolution: float = RESOLUTION) -> None:
-        """Put a checked plan under refinement; when there are too many, the dearest goes."""
-        self._candidates.append(_Candidate(self._make(plan, resolution), plan, resolution))
-        if len(self._candidates) > SIZE:
-            self._candidates.remove(max(self._candidates, key=lambda c: c.refiner.cost))
+    def add(self, plan: Plan) -> None:
+        """Put a checked plan under refinement; when there are too many, the dearest that is finished goes."""
+        self._entries.append(_Entry(plan))
+        if len(self._entries) > SIZE:
+            finished = [e for e in self._entries[:-1] if e.done] or self._entries[:-1]
+            self._entries.remove(max(finished, key=lambda e: e.cost))
 
-    def improve(self, proposals: int, incumbent: float) -> Plan | None:
-        """Give one candidate its turn; a checked plan when it is clearly cheaper than `incumbent`."""
-        if not self._candidates or not proposals:
+    def improve(self, incumbent: float) -> Plan | None:
+        """Give one plan its turn; a checked plan when it is clearly cheaper than `incumbent`."""
+        if not self._entries:
             return None
-        # The newest first gets as many proposals as the others have had, then the cheapest is favoured.
-        candidate = min(self._candidates, key=lambda c: (c.refiner.proposals // CHANCE, c.refiner.cost))
-        candidate.refiner.improve(proposals)
-        if candidate.refiner.cost > incumbent * (1 - WORTH_CHECKING):
+        entry = self._choose()
+        if entry.refiner is None:
+            entry.refiner = self._refiner(entry)
+        gain = entry.refiner.improve(_SLICE)
+        entry.proposals += _SLICE
+        if entry.proposals >= _SHORTENING and gain < _STALE * entry.cost:
+            entry.done = True
+        if entry.refiner.cost > incumbent * (1 - WORTH_CHECKING):
             return None
-        plan = self._assemble(candidate.refiner)
-        if self._accept(plan):
-            candidate.checked = plan
+        plan = self.incumbent.accepted(entry.refiner.segments(), entry.refiner.transitions)
+        if plan is not None:
+            entry.plan = plan
             return plan
         # Something slipped between the samples: go back to what was checked and look more closely.
-        self._candidates.remove(candidate)
-        self.add(candidate.checked, candidate.resolution / 2)
+        entry.resolution /= 2
+        entry.refiner = None
         return None
+
+    def _choose(self) -> _Entry:
+        fresh = [e for e in self._entries if not e.done]
+        return fresh[-1] if fresh else min(self._entries, key=lambda e: e.cost)
+
+    def _refiner(self, entry: _Entry) -> Refiner:
+        return Refiner(
+            entry.plan.segments,
+            entry.plan.transitions,
+            self.problem.cost,
+            self.collision,
+            self.validity,
+            self.roadmaps,
+            self.rng,
+            entry.resolution,
+        )

@@ -21,6 +21,8 @@ from mrtamp.model_files import model_facts, models_dir, resolve_model
 from mrtamp.placement_file import BodyFrames, read_start, read_support
 from mrtamp.problem import (
     WORLD,
+    CollisionRules,
+    Condition,
     CostWeights,
     MovableObject,
     Problem,
@@ -29,12 +31,14 @@ from mrtamp.problem import (
     RobotModel,
     Shape,
     StaticBody,
+    Subgoal,
     Support,
 )
 from mrtamp.problem_writer import problem_to_dict
 from mrtamp.reading import Document, Value, choices, data_document, read_document
 from mrtamp.resting import FACES
 from mrtamp.robot_file import load_robot_model, package_folders, read_configuration
+from mrtamp.subgoal_file import read_collision, read_subgoals
 
 __all__ = ["list_problems", "load_problem", "load_robot_model", "problem_from_dict", "problem_to_dict"]
 
@@ -45,7 +49,7 @@ SHAPES = {
     "capsule": (2, "[radius, length of the cylindrical part]"),
     "sphere": (1, "[radius]"),
 }
-TRANSITIONS = ("pick", "place", "handover")
+TRANSITIONS = ("pick", "place", "handover", "reach")
 
 
 def load_problem(source: str | Path | dict[str, Any], **params: int) -> Problem:
@@ -127,9 +131,23 @@ class _Reader:
 
     def __init__(self, document: Document) -> None:
         self.root = document.root
+        # Subgoals are a goal, too.
+        visits = isinstance(self.root.data, dict) and bool(self.root.data.get("subgoals"))
+        required = ("mrtamp", "name", "robots") if visits else ("mrtamp", "name", "robots", "goal")
         self.entries = self.root.mapping(
-            ("mrtamp", "name", "robots", "goal"),
-            ("description", "packages", "world", "supports", "objects", "cost"),
+            required,
+            (
+                "goal",
+                "description",
+                "packages",
+                "world",
+                "supports",
+                "objects",
+                "subgoals",
+                "order",
+                "collision",
+                "cost",
+            ),
         )
         self.entries["mrtamp"].version(PROBLEM_VERSION, "problem")
         self.packages = package_folders(self.entries.get("packages"))
@@ -144,12 +162,14 @@ class _Reader:
         statics = tuple(self._static(value) for value in self._named("world"))
         object_values = self._named("objects")
         support_values = self._named("supports")
+        subgoal_values = self._named("subgoals")
         max_width = max((r.model.gripper.max_width for r in robots if r.model.gripper), default=0.0)
         objects = [self._object(value, max_width) for value in object_values]
         frames = BodyFrames(statics, {o.name: o for o in objects}, self.packages)
         regions = [read_support(value, frames) for value in support_values]
         objects, starts = self._starts(object_values, objects, regions, frames)
-        goal, goals = read_goal(self.entries["goal"], robots, objects, [*regions, *starts], frames)
+        subgoals = read_subgoals(subgoal_values, self.entries.get("order"), robots, frames)
+        goal, goals = self._goal(robots, subgoals, [*regions, *starts], frames)
         description = self.entries["description"].text() if "description" in self.entries else ""
         return Problem(
             name=self.entries["name"].name(),
@@ -160,6 +180,8 @@ class _Reader:
             goal=goal,
             cost=self._cost(),
             description=description.strip(),
+            subgoals=subgoals,
+            collision=self._collision(robots, frames),
             package_paths=self.packages,
             source=self.root.data,
         )
@@ -270,6 +292,21 @@ class _Reader:
         order = [o.name for o in objects]
         supports.sort(key=lambda s: order.index(s.objects[0]) if s.objects else -1)
         return [frames.objects[name] for name in order], supports
+
+    def _goal(
+        self, robots: tuple[Robot, ...], subgoals: tuple[Subgoal, ...], supports: list[Support], frames: BodyFrames
+    ) -> tuple[tuple[Condition, ...], list[Support]]:
+        """The conditions of the goal; there may be none where there are subgoals."""
+        if subgoals and not ("goal" in self.entries and self.entries["goal"].items()):
+            return (), []
+        return read_goal(self.entries["goal"], robots, subgoals, supports, frames)
+
+    def _collision(self, robots: tuple[Robot, ...], frames: BodyFrames) -> CollisionRules:
+        return (
+            read_collision(self.entries["collision"], robots, frames)
+            if "collision" in self.entries
+            else CollisionRules()
+        )
 
     def _cost(self) -> CostWeights:
         if "cost" not in self.entries:

@@ -9,8 +9,10 @@ from pydrake.math import RigidTransform
 
 from mrtamp.problem import (
     AntipodalGrasps,
+    AtConfiguration,
     AtPose,
     Condition,
+    HandAt,
     HeldBy,
     InRegion,
     MovableObject,
@@ -19,7 +21,9 @@ from mrtamp.problem import (
     RobotAt,
     Shape,
     StaticBody,
+    Subgoal,
     Support,
+    Target,
 )
 from mrtamp.reading import pose_to_dict
 from mrtamp.robot_file import robot_reference
@@ -53,6 +57,11 @@ def problem_to_dict(problem: Problem) -> dict[str, Any]:
     synthesised = _synthesised(problem)
     data["supports"] = [_support(support) for support in problem.supports if support.name not in synthesised]
     data["objects"] = [_object(thing) for thing in problem.objects]
+    if problem.subgoals:
+        data["subgoals"] = [_subgoal(subgoal) for subgoal in problem.subgoals]
+    rules = problem.collision
+    if rules.ignore or rules.tolerance:
+        data["collision"] = {"ignore": [list(pair) for pair in rules.ignore], "tolerance": rules.tolerance}
     data["goal"] = [_condition(condition, problem) for condition in problem.goal]
     cost = problem.cost
     data["cost"] = {
@@ -119,6 +128,24 @@ def _object(thing: MovableObject) -> dict[str, Any]:
             for grasp in thing.grasps
         ],
     }
+
+
+def _subgoal(subgoal: Subgoal) -> dict[str, Any]:
+    targets = {robot: _target(target) for robot, target in subgoal.targets.items()}
+    data: dict[str, Any] = {"name": subgoal.name, "robots": targets}
+    if subgoal.after:
+        data["after"] = list(subgoal.after)
+    if subgoal.attach is not None:
+        data["attach"] = {"object": subgoal.attach.object, "to": subgoal.attach.parent}
+    return data
+
+
+def _target(target: Target) -> dict[str, Any]:
+    if isinstance(target, AtConfiguration):
+        return {"q": np.asarray(target.q).tolist()}
+    if isinstance(target, HandAt):
+        return {"hand": pose_to_dict(target.X_WG)}
+    return {"in": {"X_WC": pose_to_dict(target.X_WC), "size": list(target.size)}}
 
 
 def _condition(condition: Condition, problem: Problem) -> dict[str, Any]:

@@ -1,36 +1,77 @@
-"""Refinement of an incumbent: robot-wise shortcuts and re-timing on the composite polyline (DESIGN section 8).
+"""Refinement of a plan: shortcuts robot by robot, and re-timing of a robot across its own events (DESIGN section 8).
 
-A plan becomes a sequence of knots, one configuration per robot at each, with the knot at which every transition
-happens.  A proposal changes one robot between two of its own anchors while the others stay as they are; it is priced
-first and checked only when it pays.  Because a robot's motion may be spread over knots at which others move, arms
-come to move at the same time.
+A plan becomes a sequence of knots, one configuration per robot at each, with the knot at which every action happens.
+A shortcut changes one robot between two of its anchors while the others stay as they are.  A re-timing keeps all paths
+and moves one robot along its own earlier or later than before, past events of the others where nothing forbids it: so
+plans that move one robot at a time come to move them together.  Proposals are priced first and checked only when they
+pay.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
+from mrtamp.clearance import Clearance, Track
 from mrtamp.collision import RESOLUTION, Collision
 from mrtamp.modes import Mode
-from mrtamp.plan import Segment, Transition
+from mrtamp.plan import Action, Segment, Transition
 from mrtamp.problem import CostWeights
+from mrtamp.retiming import Grid, Timing, cut, duration, simple_timing
 from mrtamp.roadmap import Roadmap
-from mrtamp.validity import Validity
+from mrtamp.validity import Resting, Validity
 
 _KNOT = 0.3
 """Largest distance (rad) between knots after subdivision."""
 _LONGEST = 40
+_CONTACT = 0.07
+"""How far (m) the hand moves in the straight motions next to a change of attachment; they stay as they are."""
+_STRAIGHT = 1e-6
+_RETIMED = 0.25
+"""Share of proposals that are re-timings; of these, share that is searched on a grid."""
+_SEARCHED = 0.5
+_CELLS = 1500
+_DETOURS = 5
 _EPS = 1e-9
 
 
+@dataclass(frozen=True)
+class _Happening:
+    """An action, the knot at which it happens, and the straight lengths (rad) of its robots' motions beside it."""
+
+    action: Action
+    knot: int
+    contact: tuple[tuple[float, float], ...]
+
+    def at(self, knot: int) -> _Happening:
+        return _Happening(self.action, knot, self.contact)
+
+
+def must_follow(a: Action, b: Action, after: Mapping[str, Sequence[str]]) -> bool:
+    """Whether b has to stay after an action a that comes before it.
+
+    So it is when they share a robot or an object, when one object rests on the other before or afterwards, and when b
+    reaches a subgoal that is to come `after` (name -> names) that of a.
+    """
+    if set(a.robots) & set(b.robots) or (a.object is not None and a.object == b.object):
+        return True
+    for x, y in ((a, b), (b, a)):
+        parents = {c.parent for c in (x.before, x.after) if c is not None and not c.held}
+        if y.object in parents:
+            return True
+    return b.subgoal is not None and a.subgoal in after.get(b.subgoal, ())
+
+
 class Refiner:
-    """Improves one sequence of segments and transitions; event order and transition configurations stay as they are.
+    """Improves one sequence of segments and transitions; configurations at transitions stay as they are.
 
     Attributes
     ----------
     cost : cost of the current polyline, transitions included.
+    transitions, modes : what happens in the order in which it happens now, and the modes between.
     """
 
     def __init__(
@@ -45,75 +86,70 @@ class Refiner:
         resolution: float = RESOLUTION,
     ) -> None:
         self.weights = weights
-        self.collision = collision
         self.validity = validity
         self.roadmaps = roadmaps
         self.rng = rng
-        self.resolution = resolution
+        self.clearance = Clearance(collision, resolution, rng)
         self.names = list(segments[0].q)
-        self.modes: list[Mode] = [s.mode for s in segments]
-        self.transitions = list(transitions)
         self.proposals = 0
-        self._load(segments)
+        self._after = {s.name: s.after for s in collision.problem.subgoals}
+        self._start = segments[0].mode
+        self._load(segments, transitions)
         self._subdivide()
         self._measure()
+        self._settle()
 
     # -- representation -------------------------------------------------------------------------------------------
 
-    def _load(self, segments: Sequence[Segment]) -> None:
-        parts: dict[str, list[np.ndarray]] = {r: [] for r in self.names}
-        self._of_step: list[int] = []
-        self._events: list[int] = []
-        for s, segment in enumerate(segments):
-            skip = 0 if s == 0 else 1
-            for r in self.names:
-                parts[r].append(segment.q[r][skip:])
-            self._of_step += [s] * (segment.length - 1)
-            if s < len(segments) - 1:
-                self._events.append(len(self._of_step))
-        self._q = {r: np.concatenate(parts[r]) for r in self.names}
-        K = len(self._of_step) + 1
-        self._anchor = {r: np.zeros(K, dtype=bool) for r in self.names}
-        for r in self.names:
-            self._anchor[r][[0, K - 1]] = True
-        for t, knot in zip(self.transitions, self._events, strict=True):
-            for r in t.active:
-                self._protect(r, knot)
+    def _load(self, segments: Sequence[Segment], transitions: Sequence[Transition]) -> None:
+        first, *others = segments
+        self._q = {r: np.concatenate([first.q[r], *(s.q[r][1:] for s in others)]) for r in self.names}
+        knots = np.cumsum([s.length - 1 for s in segments[:-1]]).tolist()
+        self._events: list[_Happening] = []
+        for t, k in zip(transitions, knots, strict=True):
+            for a in t.actions:
+                contact = tuple((self._contact(r, a, k, -1), self._contact(r, a, k, 1)) for r in a.robots)
+                self._events.append(_Happening(a, k, contact))
 
-    def _protect(self, robot: str, knot: int) -> None:
-        """Anchor a transition and the last motion before and first motion after it: approach, lift, retreat."""
-        q, anchor = self._q[robot], self._anchor[robot]
-        for step in (-1, 1):
-            k = knot
-            while 0 <= k + step < len(q) and np.array_equal(q[k + step], q[knot]):
-                k += step
-            # Standing still at the transition may be re-timed; the motion next to it may not be changed.
-            if 0 <= k + step < len(q):
-                anchor[min(k, k + step) : max(k, k + step) + 1] = True
-        anchor[knot] = True
+    def _contact(self, robot: str, action: Action, knot: int, step: int) -> float:
+        """Length (rad) of the straight motion of a robot right before or after a change of attachment."""
+        if action.after is None:
+            return 0.0
+        q, tool = self._q[robot], self.roadmaps[robot].world.tool
+        ends = range(knot, len(q)) if step > 0 else range(knot, -1, -1)
+        path = [q[knot]]
+        for k in ends:
+            if not np.array_equal(q[k], path[-1]):
+                path.append(q[k])
+        length = 0.0
+        direction = None
+        reach = np.linalg.norm(tool.pose(np.array(path))[1] - tool.pose(q[knot : knot + 1])[1], axis=1)
+        for n, (a, b) in enumerate(pairwise(path)):
+            way = float(np.linalg.norm(b - a))
+            unit = (b - a) / way
+            if direction is not None and (unit @ direction < 1 - _STRAIGHT or reach[n] > _CONTACT):
+                break
+            direction = unit
+            length += way
+        return length
 
     def _subdivide(self) -> None:
         """Insert knots so that no step is longer than _KNOT."""
         steps = np.array([np.linalg.norm(np.diff(q, axis=0), axis=1) for q in self._q.values()])
-        pieces = np.maximum(1, np.ceil(steps.max(axis=0) / _KNOT)).astype(int) if steps.size else np.zeros(0, int)
+        if not steps.size:
+            return
+        pieces = np.maximum(1, np.ceil(steps.max(axis=0) / _KNOT)).astype(int)
         starts = np.concatenate([[0], np.cumsum(pieces)])
         t = np.concatenate([[k + j / n for j in range(n)] for k, n in enumerate(pieces)] + [[float(len(pieces))]])
-        low = np.minimum(t.astype(int), max(len(pieces) - 1, 0))
-        for r in self.names:
-            q, anchor = self._q[r], self._anchor[r]
-            if not len(pieces):
-                continue
-            fresh = q[low] + (t - low)[:, None] * (q[low + 1] - q[low])
-            fresh[starts] = q
-            inside = anchor[low] & anchor[low + 1] & np.any(q[low] != q[low + 1], axis=1)
-            inside[starts] = anchor
-            self._q[r], self._anchor[r] = fresh, inside
-        self._events = [int(starts[e]) for e in self._events]
-        self._of_step = [s for s, n in zip(self._of_step, pieces, strict=True) for _ in range(n)]
+        low = np.minimum(t.astype(int), len(pieces) - 1)
+        for r, q in self._q.items():
+            self._q[r] = q[low] + (t - low)[:, None] * (q[low + 1] - q[low])
+            self._q[r][starts] = q
+        self._events = [h.at(int(starts[h.knot])) for h in self._events]
 
     def _measure(self) -> None:
         self._lengths = np.array([np.linalg.norm(np.diff(self._q[r], axis=0), axis=1) for r in self.names])
-        changes = sum(self.weights.transitions.get(a.kind, 0.0) for t in self.transitions for a in t.actions)
+        changes = sum(self.weights.transitions.get(h.action.kind, 0.0) for h in self._events)
         self.cost = self._price(self._lengths) + changes
 
     def _price(self, lengths: np.ndarray) -> float:
@@ -121,29 +157,97 @@ class Refiner:
             return 0.0
         return float(self.weights.makespan * lengths.max(axis=0).sum() + self.weights.path_length * lengths.sum())
 
+    def _settle(self) -> None:
+        """Derive modes, transitions and anchors from what happens when."""
+        self._modes = [self._start]
+        for h in self._events:
+            self._modes.append(self._modes[-1].after(Transition((h.action,))))
+        self._of_step = np.searchsorted([h.knot for h in self._events], np.arange(self._lengths.shape[1]), side="right")
+        self._anchor = {r: self._anchors(r) for r in self.names}
+
+    def _anchors(self, robot: str) -> np.ndarray:
+        """Knots (K,) at which the robot stays where it is: ends, its transitions and the straight motions beside."""
+        K = self._lengths.shape[1] + 1
+        out = np.zeros(K, dtype=bool)
+        out[[0, K - 1]] = True
+        along = np.concatenate([[0.0], np.cumsum(self._lengths[self.names.index(robot)])])
+        for h in self._events:
+            if robot not in h.action.robots:
+                continue
+            before, after = h.contact[h.action.robots.index(robot)]
+            out[h.knot] = True
+            here = along[h.knot]
+            if before > 0:
+                # Standing next to it may be re-timed: anchors are where the straight motion begins and ends.
+                low = int(np.searchsorted(along, here - before + _EPS, side="right")) - 1
+                out[max(low, 0) : int(np.searchsorted(along, here - _EPS)) + 1] = True
+            if after > 0:
+                high = int(np.searchsorted(along, here + after - _EPS))
+                out[int(np.searchsorted(along, here + _EPS, side="right")) - 1 : min(high, K - 1) + 1] = True
+        return out
+
+    def _groups(self) -> list[tuple[int, Transition]]:
+        """Actions at the same knot as one transition where they are independent, else one after the other."""
+        out: list[tuple[int, tuple[Action, ...]]] = []
+        for h in self._events:
+            together = out and out[-1][0] == h.knot
+            if together and not any(must_follow(a, h.action, self._after) for a in out[-1][1]):
+                out[-1] = (h.knot, (*out[-1][1], h.action))
+            else:
+                out.append((h.knot, (h.action,)))
+        return [(k, Transition(actions)) for k, actions in out]
+
+    @property
+    def transitions(self) -> list[Transition]:
+        """The transitions in their present order."""
+        return [t for _, t in self._groups()]
+
+    @property
+    def modes(self) -> list[Mode]:
+        """The modes of the segments."""
+        out = [self._start]
+        for t in self.transitions:
+            out.append(out[-1].after(t))
+        return out
+
     def segments(self) -> list[Segment]:
         """The current polyline as segments."""
-        bounds = [0, *self._events, len(self._of_step)]
+        bounds = [0, *(k for k, _ in self._groups()), self._lengths.shape[1]]
         return [
             Segment(mode, {r: self._q[r][a : b + 1].copy() for r in self.names})
-            for mode, a, b in zip(self.modes, bounds[:-1], bounds[1:], strict=True)
+            for mode, (a, b) in zip(self.modes, pairwise(bounds), strict=True)
         ]
 
     def _compress(self) -> None:
-        """Drop steps in which nobody moves."""
-        still = self._lengths.max(axis=0) <= _EPS
-        if not still.any():
-            return
-        keep = np.concatenate([[True], ~still])
-        # A dropped knot equals the one kept before it; whatever was anchored there is anchored here.
-        kept = np.cumsum(keep) - 1
-        for r in self.names:
-            anchor = np.zeros(int(keep.sum()), dtype=bool)
-            np.logical_or.at(anchor, kept, self._anchor[r])
-            self._q[r], self._anchor[r] = self._q[r][keep], anchor
-        self._events = [int(kept[e]) for e in self._events]
-        self._of_step = [s for s, dead in zip(self._of_step, still, strict=True) if not dead]
-        self._measure()
+        """Drop knots at which nobody changes speed, and steps in which nobody moves."""
+        for _ in range(3):
+            K = self._lengths.shape[1] + 1
+            drop = np.zeros(K, dtype=bool)
+            if K > 1:
+                # A knot that equals the one before is dropped; what happens there happens at the one before.
+                drop[1:] = self._lengths.max(axis=0) <= _EPS
+            if not drop.any() and K > 2:
+                composite = np.concatenate([self._q[r] for r in self.names], axis=1)
+                a, b = np.diff(composite, axis=0)[:-1], np.diff(composite, axis=0)[1:]
+                la, lb = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+                bend = np.linalg.norm(a * lb[:, None] - b * la[:, None], axis=1) / (la + lb)
+                peak = self._lengths.max(axis=0)
+                drop[1:-1] = (bend < 1e-10) & (peak[:-1] + peak[1:] <= _KNOT)
+                drop[[h.knot for h in self._events]] = False
+                for k in np.flatnonzero(drop[1:] & drop[:-1]) + 1:
+                    # Of neighbouring knots only every other one: the rest is judged anew.
+                    drop[k] &= not drop[k - 1]
+            if not drop.any():
+                break
+            kept = np.cumsum(~drop) - 1
+            exact = [{r: self._q[r][h.knot] for r in h.action.robots} for h in self._events]
+            self._q = {r: q[~drop] for r, q in self._q.items()}
+            self._events = [h.at(int(kept[h.knot])) for h in self._events]
+            for h, at in zip(self._events, exact, strict=True):
+                for r, x in at.items():
+                    self._q[r][h.knot] = x
+            self._measure()
+        self._settle()
 
     # -- proposals ------------------------------------------------------------------------------------------------
 
@@ -152,15 +256,17 @@ class Refiner:
         before = self.cost
         for _ in range(proposals):
             self.proposals += 1
-            self._propose()
+            if len(self.names) > 1 and self.rng.random() < _RETIMED:
+                self._retime()
+            else:
+                self._shortcut()
         self._compress()
         return before - self.cost
 
-    def _propose(self) -> None:
+    def _shortcut(self) -> None:
         index = int(self.rng.integers(len(self.names)))
         robot = self.names[index]
-        q, anchor = self._q[robot], self._anchor[robot]
-        anchors = np.flatnonzero(anchor)
+        q, anchors = self._q[robot], np.flatnonzero(self._anchor[robot])
         gaps = np.flatnonzero(np.diff(anchors) > 1)
         if not len(gaps):
             return
@@ -213,73 +319,196 @@ class Refiner:
         fresh[0], fresh[-1] = q[0], q[-1]
         return fresh
 
-    # -- validity -------------------------------------------------------------------------------------------------
-
     def _is_free(self, robot: str, i: int, fresh: np.ndarray) -> bool:
         """Whether the robot may move through `fresh` (m, n) from knot i on, the others as they are."""
-        world = self.roadmaps[robot].world
-        if np.any(fresh < world.chain.lower) or np.any(fresh > world.chain.upper):
+        chain = self.roadmaps[robot].world.chain
+        if np.any(fresh < chain.lower) or np.any(fresh > chain.upper):
             return False
-        m = len(fresh)
-        spheres = {r: self.roadmaps[r].world.bounds.spheres(self._q[r][i : i + m]) for r in self.names if r != robot}
-        own = world.bounds.spheres(fresh)
-        R, p = world.tool.pose(fresh)
-        hand = p[:, None] + np.einsum("nij,kj->nki", R, 0.1 * np.eye(3))
-        travel = np.maximum(
-            np.linalg.norm(np.diff(own, axis=0), axis=2).max(axis=1),
-            np.linalg.norm(np.diff(hand, axis=0), axis=2).max(axis=1),
-        )
-        for x in spheres.values():
-            travel = np.maximum(travel, np.linalg.norm(np.diff(x, axis=0), axis=2).max(axis=1))
-        pieces = np.maximum(1, np.ceil(1.1 * travel / self.resolution)).astype(int)
-        of_step = np.array(self._of_step[i : i + m - 1])
-        for s in np.unique(of_step):
-            steps = np.flatnonzero(of_step == s)
-            k = np.repeat(steps, pieces[steps])
-            t = np.concatenate([np.arange(n) / n for n in pieces[steps]])
-            k, t = np.append(k, steps[-1]), np.append(t, 1.0)
-            if not self._segment_is_free(robot, self.modes[s], i, fresh, k, t):
-                return False
-        return True
-
-    def _segment_is_free(self, robot: str, mode: Mode, i: int, fresh: np.ndarray, k: np.ndarray, t: np.ndarray) -> bool:
-        world = self.roadmaps[robot].world
-        q = fresh[k] + t[:, None] * (fresh[k + 1] - fresh[k])
-        held = mode.held.get(robot)
-        order = self.rng.permutation(len(q))
-        centres = world.bounds.spheres(q)
-        radii = world.bounds.radii
-        if held is not None:
-            R, p = world.tool.pose(q)
-            centres = np.concatenate([centres, (p + R @ held.X_PO[:3, 3])[:, None]], axis=1)
-            radii = np.append(radii, world.object_radius[held.object])
-        near = {
-            o.name: o.X_WO
-            for o in self.validity.resting(mode)
-            if np.min(np.linalg.norm(centres - o.X_WO[:3, 3], axis=2) - radii) < world.object_radius[o.name] + 0.02
-        }
-        if world.first_hit(world.rows(q, held, near)[order]) >= 0:
-            return False
+        j = i + len(fresh) - 1
+        modes = [self._modes[s] for s in self._of_step[i:j]]
+        steps = np.arange(j - i)
+        own = self._track(robot, fresh, modes)
         for other in self.names:
-            if other == robot:
-                continue
-            theirs = self._q[other][i + k] + t[:, None] * (self._q[other][i + k + 1] - self._q[other][i + k])
-            their_world = self.roadmaps[other].world
-            there = their_world.bounds.spheres(theirs)
-            sizes = their_world.bounds.radii
-            load = mode.held.get(other)
-            if load is not None:
-                R, p = their_world.tool.pose(theirs)
-                there = np.concatenate([there, (p + R @ load.X_PO[:3, 3])[:, None]], axis=1)
-                sizes = np.append(sizes, their_world.object_radius[load.object])
-            gap = np.linalg.norm(centres[:, :, None] - there[:, None], axis=3) - radii[None, :, None] - sizes
-            close = np.flatnonzero(gap.min(axis=(1, 2)) < 0.02)
-            if not len(close):
-                continue
-            close = self.rng.permutation(close)
-            pair, swapped = self.collision.pair(robot, other)
-            first, second = (q[close], held), (theirs[close], load)
-            hit = pair.first_hit(*second, *first) if swapped else pair.first_hit(*first, *second)
-            if hit >= 0:
+            if (
+                other != robot
+                and self.clearance.pair(own, self._track(other, self._q[other][i : j + 1], modes), steps) >= 0
+            ):
                 return False
-        return True
+        return self.clearance.world(own, steps, [self.validity.resting(m) for m in modes], static=True) < 0
+
+    def _track(self, robot: str, q: np.ndarray, modes: Sequence[Mode]) -> Track:
+        return Track(self.roadmaps[robot], q, [m.held.get(robot) for m in modes])
+
+    # -- re-timing ------------------------------------------------------------------------------------------------
+
+    def _retime(self) -> None:
+        """Move one robot along its own path at another time, between two knots that stay."""
+        index = int(self.rng.integers(len(self.names)))
+        window = self._window(self.names[index])
+        if window is None:
+            return
+        i, j = window
+        pace = np.delete(self._lengths[:, i:j], index, axis=0).max(axis=0)
+        plane = _Plane(
+            index,
+            i,
+            j,
+            np.concatenate([[0.0], np.cumsum(pace)]),
+            np.concatenate([[0.0], np.cumsum(self._lengths[index, i:j])]),
+            [n for n, h in enumerate(self._events) if i < h.knot < j],
+        )
+        T, L = plane.clock[-1], plane.progress[-1]
+        present = float(self._lengths[:, i:j].max(axis=0).sum())
+        if L <= _EPS or T <= _EPS or present - max(T, L) <= 1e-6:
+            return
+        if self.rng.random() < _SEARCHED:
+            self._search(plane, present)
+        else:
+            path = simple_timing(T, L, self.rng)
+            if duration(path) < present - 1e-6:
+                self._try(plane, path)
+
+    def _window(self, robot: str) -> tuple[int, int] | None:
+        """Two knots between which no action needs the robot together with others."""
+        K = self._lengths.shape[1] + 1
+        fixed = sorted(
+            {0, K - 1, *(h.knot for h in self._events if robot in h.action.robots and len(h.action.robots) > 1)}
+        )
+        i = int(self.rng.integers(K))
+        low = max((k for k in fixed if k <= i), default=0)
+        high = min((k for k in fixed if k > low), default=K - 1)
+        kind = self.rng.random()
+        if kind < 0.25:
+            i, j = low, high
+        else:
+            span = 2 + int((high - low) * self.rng.random() ** 2)
+            i = int(self.rng.integers(low, max(high - span, low) + 1))
+            j = min(i + span, high)
+        return (i, j) if j - i >= 2 else None
+
+    def _cut(self, plane: _Plane, path: np.ndarray) -> Timing | None:
+        events, before = [], []
+        robot = self.names[plane.index]
+        inside = [self._events[n].action for n in plane.events]
+        for n, a in zip(plane.events, inside, strict=True):
+            own = robot in a.robots
+            events.append((own, float((plane.progress if own else plane.clock)[self._events[n].knot - plane.i])))
+        for m, b in enumerate(inside):
+            before.append([x for x in range(m) if must_follow(inside[x], b, self._after)])
+        return cut(path, plane.clock, plane.progress, events, before)
+
+    def _try(self, plane: _Plane, path: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Check a timing and take it; returns the leg (c, p) to (c, p) that is in the way, if any."""
+        timing = self._cut(plane, path)
+        if timing is None:
+            return None
+        i, j, M = plane.i, plane.j, len(timing.c)
+        q = {}
+        for n, r in enumerate(self.names):
+            clock, at = (plane.progress, timing.p) if n == plane.index else (plane.clock, timing.c)
+            old = self._q[r][i : j + 1]
+            q[r] = np.column_stack([np.interp(at, clock, old[:, d]) for d in range(old.shape[1])])
+            q[r][0], q[r][-1] = old[0], old[-1]
+        moved = [self._events[n].at(i + k) for n, k in zip(plane.events, timing.events, strict=True)]
+        # The sort is stable, and actions that must follow each other are in their old order.
+        moved.sort(key=lambda h: h.knot)
+        for h in moved:
+            for r in h.action.robots:
+                old_knot = next(x.knot for x in self._events if x.action is h.action)
+                q[r][h.knot - i] = self._q[r][old_knot]
+        first = next((n for n, h in enumerate(self._events) if h.knot > i), len(self._events))
+        modes = [self._modes[first]]
+        for h in moved:
+            modes.append(modes[-1].after(Transition((h.action,))))
+        of_step = np.searchsorted([h.knot - i for h in moved], np.arange(M - 1), side="right")
+        step = self._first_conflict(plane, timing, q, [modes[s] for s in of_step])
+        if step >= 0:
+            a, b = (np.array([timing.c[k], timing.p[k]]) for k in (step, step + 1))
+            return a, b
+        later = len(timing.c) - (j - i + 1)
+        self._q = {r: np.concatenate([x[:i], q[r], x[j + 1 :]]) for r, x in self._q.items()}
+        earlier = [h for h in self._events if h.knot <= i]
+        self._events = [*earlier, *moved, *(h.at(h.knot + later) for h in self._events if h.knot >= j and h.knot > i)]
+        self._measure()
+        self._compress()
+        return None
+
+    def _first_conflict(self, plane: _Plane, timing: Timing, q: dict[str, np.ndarray], modes: list[Mode]) -> int:
+        """A step of a re-timed window in which something is in the way, or -1."""
+        i = plane.i
+        middle_c, middle_p = ((x[1:] + x[:-1]) / 2 for x in (timing.c, timing.p))
+        last = plane.j - plane.i - 1
+        theirs = np.clip(np.searchsorted(plane.clock, middle_c) - 1, 0, last)
+        own = np.clip(np.searchsorted(plane.progress, middle_p) - 1, 0, last)
+        robot = self.names[plane.index]
+        same = (np.abs(np.interp(timing.p, plane.progress, plane.clock) - timing.c) < _EPS) | (
+            np.abs(np.interp(timing.c, plane.clock, plane.progress) - timing.p) < _EPS
+        )
+        before = [self._modes[s] for s in self._of_step[i : plane.j]]
+        changed = np.array(
+            [not (same[k] and same[k + 1] and theirs[k] == own[k] and m is before[own[k]]) for k, m in enumerate(modes)]
+        )
+        steps = np.flatnonzero(changed)
+        tracks = {r: self._track(r, q[r], modes) for r in self.names}
+        for r in self.names:
+            if r != robot:
+                hit = self.clearance.pair(tracks[robot], tracks[r], steps)
+                if hit >= 0:
+                    return hit
+        # Each robot moves as before: only objects that did not rest there at that point of its path are new to it.
+        for r in self.names:
+            old_step = own if r == robot else theirs
+            fresh: list[tuple[Resting, ...]] = []
+            for k, m in enumerate(modes):
+                known = {x.chain for x in self.validity.resting(before[old_step[k]])} if changed[k] else set()
+                fresh.append(tuple(x for x in self.validity.resting(m) if x.chain not in known) if changed[k] else ())
+            hit = self.clearance.world(
+                tracks[r], np.array([k for k in steps if fresh[k]], dtype=int), fresh, static=False
+            )
+            if hit >= 0:
+                return hit
+        return -1
+
+    def _search(self, plane: _Plane, present: float) -> None:
+        """Look for the shortest timing among those that are not in conflict, on a grid of both clocks."""
+        T, L = float(plane.clock[-1]), float(plane.progress[-1])
+        h = max(0.1, np.sqrt(T * L / _CELLS))
+        robot = self.names[plane.index]
+        acts = [(robot in self._events[n].action.robots, self._events[n]) for n in plane.events]
+        marks = [float((plane.progress if own else plane.clock)[e.knot - plane.i]) for own, e in acts]
+        cs = _lines(T, h, [m for m, (own, _) in zip(marks, acts, strict=True) if not own])
+        ps = _lines(L, h, [m for m, (own, _) in zip(marks, acts, strict=True) if own])
+        grid = Grid(cs, ps)
+        for x, (own_a, a) in enumerate(acts):
+            for y in range(x + 1, len(acts)):
+                own_b, b = acts[y]
+                if own_a != own_b and must_follow(a.action, b.action, self._after):
+                    c, p = (marks[y], marks[x]) if own_a else (marks[x], marks[y])
+                    grid.forbid(c, p, robot_waits=own_b)
+        for _ in range(_DETOURS):
+            path = grid.timing()
+            if path is None or duration(path) >= present - 1e-6:
+                return
+            hit = self._try(plane, path)
+            if hit is None:
+                return
+            grid.block(*hit)
+
+
+@dataclass(frozen=True, eq=False)
+class _Plane:
+    """A window of knots i..j of robot number `index`: the clocks of the others and its own, and the events inside."""
+
+    index: int
+    i: int
+    j: int
+    clock: np.ndarray
+    progress: np.ndarray
+    events: list[int]
+
+
+def _lines(length: float, step: float, marks: list[float]) -> np.ndarray:
+    """Grid lines on [0, length] at most `step` apart, with one at every mark."""
+    corners = np.unique([0.0, *marks, length])
+    parts = [np.linspace(a, b, max(1, int(np.ceil((b - a) / step))) + 1)[:-1] for a, b in pairwise(corners)]
+    return np.concatenate([*parts, [length]])

@@ -10,13 +10,16 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from mrtamp.modes import Attachment
-from mrtamp.plan import Plan, measures
+from mrtamp.plan import Action, Plan, measures
 from mrtamp.playback import Playback
 
 
 @dataclass(frozen=True)
 class Row:
-    """One elementary change in the timeline; simultaneous ones share `step` and `time`."""
+    """One elementary change in the timeline; simultaneous ones share `step` and `time`.
+
+    `object` goes from `source` to `target`; all three are empty where a subgoal attaches nothing.
+    """
 
     step: int
     time: float
@@ -25,6 +28,7 @@ class Row:
     object: str
     source: str
     target: str
+    subgoal: str = ""
 
     @property
     def sentence(self) -> str:
@@ -35,7 +39,25 @@ class Row:
             return f"{self.robots[0]} places {self.object} {self._at_target()}"
         if self.kind == "handover" and len(self.robots) == 2:
             return f"{self.robots[0]} hands {self.object} to {self.robots[1]}"
-        return f"{' and '.join(self.robots)}: {self.kind} {self.object}"
+        if self.kind == "reach":
+            verb = "reaches" if len(self.robots) == 1 else "reach"
+            return f"{_listed(self.robots)} {verb} {self.subgoal}{self._change()}"
+        return f"{_listed(self.robots)}: {self.kind} {self.object}"
+
+    def _change(self) -> str:
+        """What reaching a subgoal does to an object, as the end of a sentence."""
+        if not self.object:
+            return ""
+        if self.target in self.robots:
+            taker = "takes" if len(self.robots) == 1 else f"{self.target} takes"
+            return f" and {taker} {self.object}"
+        return f", {self.object} stays there"
+
+    @property
+    def change(self) -> str:
+        """Where the object comes from and goes to, or the subgoal, as the last column of the timeline."""
+        moved = f"{self.source} -> {self.target}" if self.object else ""
+        return ": ".join(text for text in (self.subgoal, moved) if text)
 
     def _at_target(self) -> str:
         """The target in a sentence; supports made from exact poses and object tops have names of their own form."""
@@ -45,18 +67,29 @@ class Row:
         return f"on {self.target}"
 
 
-def _where(attachment: Attachment) -> str:
+def _listed(names: Sequence[str]) -> str:
+    """Names in a sentence: `a`, `a and b`, `a, b and c`."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def _where(attachment: Attachment | None) -> str:
     """The place of an attachment, in a word or two."""
+    if attachment is None:
+        return ""
     return attachment.place if attachment.held or attachment.support else attachment.parent
 
 
+def _row(step: int, time: float, a: Action) -> Row:
+    # A subgoal names the place where it leaves an object after itself: that would say the same thing twice.
+    target = a.after.parent if a.kind == "reach" and a.after is not None else _where(a.after)
+    return Row(step, time, a.kind, a.robots, a.object or "", _where(a.before), target, a.subgoal or "")
+
+
 def timeline(plan: Plan, playback: Playback | None = None) -> list[Row]:
-    """Every change of attachment in order; `time` is when it happens on the clock of `Playback` (s)."""
+    """Every change of attachment and every subgoal, in order; `time` is the moment on the clock of `Playback` (s)."""
     playback = playback or Playback(plan)
     return [
-        Row(step, event.start, a.kind, a.robots, a.object, _where(a.before), _where(a.after))
-        for step, event in enumerate(playback.events, 1)
-        for a in event.transition.actions
+        _row(step, event.start, a) for step, event in enumerate(playback.events, 1) for a in event.transition.actions
     ]
 
 
@@ -72,12 +105,13 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[
     return "\n".join(line.rstrip() for line in lines)
 
 
+def _arrows(row: Row) -> str:
+    return (", " if row.kind == "reach" else " -> ").join(row.robots)
+
+
 def timeline_text(plan: Plan, playback: Playback | None = None) -> str:
     """The timeline as a table."""
-    rows = [
-        (str(r.step), f"{r.time:.2f} s", r.kind, " -> ".join(r.robots), r.object, f"{r.source} -> {r.target}")
-        for r in timeline(plan, playback)
-    ]
+    rows = [(str(r.step), f"{r.time:.2f} s", r.kind, _arrows(r), r.object, r.change) for r in timeline(plan, playback)]
     if not rows:
         return "(no transitions: the robots only move)"
     return table(("step", "time", "kind", "robots", "object", "from -> to"), rows, right=(0, 1))

@@ -18,6 +18,8 @@ from mrtamp.collision import RESOLUTION, RobotWorld
 
 _COARSE = 5
 _HAND = 0.1
+_KEPT_SPHERES = 20_000
+"""Edges per robot whose bounding spheres are kept (some 8 kB each): old ones are computed again when asked for."""
 
 
 class Roadmap:
@@ -40,9 +42,12 @@ class Roadmap:
         self.n_vertices = 0
         self.n_edges = 0
         self._edge_of: dict[tuple[int, int], int] = {}
+        self._adjacent: list[list[int]] = []
+        self._arcs = _Arcs()
         self.contact: dict[int, tuple[str, str]] = {}
         self.exits: dict[int, list[int]] = {}
         self._open: list[int] = []
+        self._open_q = np.empty((64, self.n_dof))
         self._samples: dict[int, int] = {}
         self._spheres: dict[int, np.ndarray] = {}
         # Points of the hand (and of the largest object it may carry) that rotate far from any body's centre.
@@ -70,20 +75,28 @@ class Roadmap:
         i = self.n_vertices
         self._q[i] = q
         self.n_vertices += 1
+        self._adjacent.append([])
         if connect:
             self._connect(i)
-            self._open.append(i)
+            self._open_up(i)
         return i
 
+    def _open_up(self, i: int) -> None:
+        n = len(self._open)
+        if n == len(self._open_q):
+            self._open_q = np.concatenate([self._open_q, np.empty_like(self._open_q)])
+        self._open_q[n] = self._q[i]
+        self._open.append(i)
+
     def _connect(self, i: int) -> None:
-        if not self._open:
+        n = len(self._open)
+        if not n:
             return
-        others = np.array(self._open)
-        distance = np.linalg.norm(self._q[others] - self._q[i], axis=1)
-        # k = e (1 + 1/d) log n: Karaman and Frazzoli (2011), PRM*.
-        k = int(np.ceil(np.e * (1 + 1 / self.n_dof) * np.log(len(others) + 1))) + 1
-        for j in np.argsort(distance, kind="stable")[:k]:
-            self.edge(i, int(others[j]))
+        distance = np.linalg.norm(self._open_q[:n] - self._q[i], axis=1)
+        k = prm_star_neighbours(n, self.n_dof)
+        nearest = np.argpartition(distance, k)[:k] if k < n else np.arange(n)
+        for j in nearest[np.argsort(distance[nearest], kind="stable")]:
+            self.edge(i, self._open[j])
 
     def edge(self, a: int, b: int) -> int:
         """The edge between two vertices, made if need be; (a, a) is the degenerate edge of standing at a."""
@@ -99,7 +112,16 @@ class Roadmap:
         self._w[e] = np.linalg.norm(self._q[a] - self._q[b])
         self._edge_of[key] = e
         self.n_edges += 1
+        if a != b:
+            self._adjacent[a].append(b)
+            self._adjacent[b].append(a)
+            self._arcs.add(a, b, e)
         return e
+
+    def length(self, a: int, b: int) -> float:
+        """Length (rad) of the straight motion between two vertices."""
+        e = self._edge_of.get((a, b) if a <= b else (b, a))
+        return float(self._w[e]) if e is not None else float(np.linalg.norm(self._q[b] - self._q[a]))
 
     def n_samples(self, e: int) -> int:
         """How many samples, ends included, keep consecutive ones within the resolution."""
@@ -122,6 +144,8 @@ class Roadmap:
         if known is None:
             known = self.world.bounds.spheres(self.path_samples(e)).astype(np.float32)
             self._spheres[e] = known
+            if len(self._spheres) > _KEPT_SPHERES:
+                del self._spheres[next(iter(self._spheres))]
         return known
 
     def offer_direct(self, a: int, b: int) -> None:
@@ -132,14 +156,14 @@ class Roadmap:
                     self.edge(i, j)
 
     def shortest(self, start: int, goal: int, blocked: np.ndarray) -> list[int] | None:
-        """Vertices of the shortest path that avoids edges marked in `blocked` (E,), or None."""
+        """Vertices of the shortest path that avoids edges marked in `blocked`, or None.
+
+        `blocked` may be shorter than E: edges younger than it are not blocked.
+        """
         if start == goal:
             return [start]
-        ends = self.ends
-        keep = ~blocked & (ends[:, 0] != ends[:, 1])
-        u, v, w = ends[keep, 0], ends[keep, 1], np.maximum(self.w[keep], 1e-9)
-        graph = csr_array((w, (u, v)), shape=(self.n_vertices, self.n_vertices))
-        distance, parent = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
+        graph = self._arcs.weighted(self.ends, self.w, self.n_vertices, blocked)
+        distance, parent = dijkstra(graph, indices=start, return_predecessors=True)
         if not np.isfinite(distance[goal]):
             return None
         path = [goal]
@@ -147,15 +171,83 @@ class Roadmap:
             path.append(int(parent[path[-1]]))
         return path[::-1]
 
-    def neighbours(self, a: int) -> list[int]:
-        """Vertices that share an edge with `a`."""
-        ends = self.ends
-        out = np.concatenate([ends[ends[:, 0] == a, 1], ends[ends[:, 1] == a, 0]])
-        return [int(i) for i in np.unique(out) if i != a]
+    def distances_to(self, target: int, blocked: np.ndarray | None = None) -> np.ndarray:
+        """Lengths (V,), rad, of the shortest paths from every vertex to `target` that avoid `blocked` (E,) edges."""
+        graph = self._arcs.weighted(self.ends, self.w, self.n_vertices, blocked)
+        return dijkstra(graph, indices=target)[: self.n_vertices]
+
+    def neighbours(self, a: int) -> Sequence[int]:
+        """Vertices that share an edge with `a`, in the order in which the edges were made."""
+        return self._adjacent[a]
 
     def open_vertices(self) -> Sequence[int]:
         """Vertices that are not transitions or their chains."""
         return self._open
+
+
+class _Arcs:
+    """Both directions of all edges as rows of a sparse matrix with room to grow.
+
+    Searches and new edges alternate, and building the matrix takes longer than searching it.  So rows have spare
+    places, where unused ones point at their own row with infinite weight, and the matrix is laid out anew only when
+    there is no room left.
+    """
+
+    def __init__(self) -> None:
+        self._start = np.zeros(1, dtype=np.int32)
+        self._used = np.zeros(0, dtype=np.int64)
+        self._target = np.zeros(0, dtype=np.int32)
+        self._edge = np.zeros(0, dtype=np.int64)
+        self._stale = True
+
+    def add(self, a: int, b: int, e: int) -> None:
+        """Add both directions of edge e."""
+        if self._stale:
+            return
+        rows = len(self._used)
+        if a >= rows or b >= rows:
+            self._stale = True
+            return
+        for u, v in ((a, b), (b, a)):
+            k = self._start[u] + self._used[u]
+            if k == self._start[u + 1]:
+                self._stale = True
+                return
+            self._target[k], self._edge[k] = v, e
+            self._used[u] += 1
+
+    def weighted(self, ends: np.ndarray, w: np.ndarray, n_vertices: int, blocked: np.ndarray | None) -> csr_array:
+        """The matrix, with at least V rows, for edges `ends` (E, 2) of lengths w (E,); `blocked` (E,) are left out."""
+        if self._stale or n_vertices > len(self._used):
+            self._lay_out(ends, n_vertices)
+        weight = np.full(len(w) + 1, np.inf)
+        np.maximum(w, 1e-9, out=weight[:-1])
+        if blocked is not None:
+            weight[: len(blocked)][blocked] = np.inf
+        n = len(self._used)
+        return csr_array((weight[self._edge], self._target, self._start), shape=(n, n))
+
+    def _lay_out(self, ends: np.ndarray, n_vertices: int) -> None:
+        rows = n_vertices + n_vertices // 4 + 16
+        e = np.flatnonzero(ends[:, 0] != ends[:, 1])
+        u, v = ends[e].T
+        source, target, edge = np.concatenate([u, v]), np.concatenate([v, u]), np.concatenate([e, e])
+        # NumPy sorts small integers by radix, an order of magnitude faster.
+        order = np.argsort(source.astype(np.min_scalar_type(rows)), kind="stable")
+        self._used = np.bincount(source, minlength=rows)
+        room = self._used + self._used // 4 + 8
+        self._start = np.concatenate([[0], np.cumsum(room)]).astype(np.int32)
+        self._target = np.repeat(np.arange(rows, dtype=np.int32), room)
+        self._edge = np.full(len(self._target), -1)
+        first = np.cumsum(self._used) - self._used
+        place = np.repeat(self._start[:-1] - first, self._used) + np.arange(len(order))
+        self._target[place], self._edge[place] = target[order], edge[order]
+        self._stale = False
+
+
+def prm_star_neighbours(n: int, dof: int) -> int:
+    """How many nearest of n vertices a new one is joined to: k > e (1 + 1/d) log n (Karaman and Frazzoli, 2011)."""
+    return int(np.ceil(np.e * (1 + 1 / dof) * np.log(n + 1))) + 1
 
 
 def samples_between(world: RobotWorld, points: np.ndarray, a: np.ndarray, b: np.ndarray) -> int:

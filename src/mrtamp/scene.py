@@ -11,7 +11,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Box, Capsule, CollisionFilterDeclaration, Cylinder, GeometrySet, SceneGraph, Sphere
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    CollisionFilterDeclaration,
+    Cylinder,
+    GeometryId,
+    GeometrySet,
+    SceneGraph,
+    Sphere,
+)
 from pydrake.geometry import Shape as DrakeShape
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
@@ -21,7 +30,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from mrtamp.kinematics import Chain, Tool, quaternions
 from mrtamp.model_files import make_parser
-from mrtamp.problem import MovableObject, MrtampError, Problem, Robot, RobotModel, Shape, StaticBody
+from mrtamp.problem import CollisionRules, MovableObject, MrtampError, Problem, Robot, RobotModel, Shape, StaticBody
 
 
 def drake_shape(shape: Shape) -> DrakeShape:
@@ -52,7 +61,8 @@ class RobotInScene:
 class Scene:
     """A finalised plant with its scene graph, and the maps from names to its parts.
 
-    `floating` maps the name of each free body to the first of its seven columns in q (qw, qx, qy, qz, x, y, z).
+    `floating` maps the name of each free body to the first of its seven columns in q (qw, qx, qy, qz, x, y, z),
+    `stands_for` to the object it stands for; `grown` says by how much (m) collision geometries are padded.
     """
 
     diagram: Diagram
@@ -62,6 +72,8 @@ class Scene:
     statics: dict[str, list[RigidBody]]
     floating: dict[str, int] = field(default_factory=dict)
     free_bodies: dict[str, list[RigidBody]] = field(default_factory=dict)
+    stands_for: dict[str, str] = field(default_factory=dict)
+    grown: dict[GeometryId, float] = field(default_factory=dict)
 
     def context(self) -> tuple[Context, Context]:
         """A fresh root context and the plant's context inside it."""
@@ -140,12 +152,13 @@ def build_scene(
     padding: Mapping[str, float] | None = None,
     builder: DiagramBuilder | None = None,
 ) -> Scene:
-    """Build and finalise a plant.
+    """Build and finalise a plant; pairs that the problem's collision rules ignore never collide in it.
 
     Parameters
     ----------
     robots : names of the robots to include (default: all).
-    free_bodies : free body name -> the object whose shape it has (default: every object under its own name).
+    free_bodies : free body name -> the object whose shape it has, and whose collision rules apply to it (default: every
+        object under its own name).
     visuals : keep illustration geometry (planning plants do not need it).
     padding : robot name -> metres by which its primitive collision shapes grow, fingers and hand excepted.
     builder : a diagram builder to add the plant to; the caller then builds the diagram (`Scene.diagram` is None).
@@ -179,12 +192,14 @@ def build_scene(
             bodies[name] = _add_model(plant, parser, item.model or "", None)
     plant.Finalize()
     _filter_exceptions(plant, scene_graph, included, instances)
-    if padding:
-        for name, extra in padding.items():
-            _pad(plant, scene_graph, included[name], instances[name], extra)
+    grown = {
+        g: extra
+        for name, extra in (padding or {}).items()
+        for g in _pad(plant, scene_graph, included[name], instances[name], extra)
+    }
 
     in_scene = {name: _robot_in_scene(plant, robot, instances[name]) for name, robot in included.items()}
-    return Scene(
+    scene = Scene(
         diagram=builder.Build() if own_builder else None,
         plant=plant,
         scene_graph=scene_graph,
@@ -192,7 +207,12 @@ def build_scene(
         statics=static_bodies,
         floating={name: b[0].floating_positions_start() for name, b in bodies.items()},
         free_bodies=bodies,
+        stands_for={name: item.name for name, item in free.items()},
+        grown=grown,
     )
+    # Last: growing a shape drops the filters it is in.
+    _filter_ignored(scene, problem.collision)
+    return scene
 
 
 def _robot_in_scene(plant: MultibodyPlant, robot: Robot, instance: ModelInstanceIndex) -> RobotInScene:
@@ -221,9 +241,27 @@ def robot_bodies(plant: MultibodyPlant, in_scene: RobotInScene) -> list[RigidBod
 
 
 def gripper_bodies(plant: MultibodyPlant, in_scene: RobotInScene) -> list[RigidBody]:
-    """The bodies of a robot that may touch what it holds."""
-    gripper = in_scene.robot.model.gripper
-    return [plant.GetBodyByName(b, in_scene.instance) for b in gripper.bodies] if gripper else []
+    """The bodies of a robot that may touch what it holds; without a gripper the one that carries its grasp frame."""
+    return [plant.GetBodyByName(b, in_scene.instance) for b in touching_bodies(in_scene.robot.model)]
+
+
+def touching_bodies(model: RobotModel) -> tuple[str, ...]:
+    """Names of the bodies of a robot that may touch what it holds."""
+    return model.gripper.bodies if model.gripper else (model.grasp_body,)
+
+
+def bodies_of(scene: Scene, thing: str) -> list[RigidBody]:
+    """The bodies in a plant that a collision rule means by `thing`: a robot, robot/body, a static body or an object.
+
+    Of an object these are all free bodies that stand for it; of what is not in the plant, none.
+    """
+    robot, _, body = thing.partition("/")
+    if robot in scene.robots:
+        bodies = robot_bodies(scene.plant, scene.robots[robot])
+        return [b for b in bodies if b.name() == body] if body else bodies
+    if thing in scene.statics:
+        return scene.statics[thing]
+    return [b for name, bodies in scene.free_bodies.items() if scene.stands_for[name] == thing for b in bodies]
 
 
 def _filter_exceptions(
@@ -240,10 +278,18 @@ def _filter_exceptions(
             manager.Apply(CollisionFilterDeclaration().ExcludeBetween(*sets))
 
 
+def _filter_ignored(scene: Scene, rules: CollisionRules) -> None:
+    """Apply the problem's collision rules as far as the plant holds both things of a pair."""
+    manager = scene.scene_graph.collision_filter_manager()
+    for pair in rules.ignore:
+        sets = [GeometrySet(geometry_ids(scene.plant, bodies_of(scene, thing))) for thing in pair]
+        manager.Apply(CollisionFilterDeclaration().ExcludeBetween(*sets))
+
+
 def _pad(
     plant: MultibodyPlant, scene_graph: SceneGraph, robot: Robot, instance: ModelInstanceIndex, extra: float
-) -> None:
-    """Grow a robot's primitive collision shapes, so that motion between checked samples is covered too.
+) -> list[GeometryId]:
+    """Grow a robot's primitive collision shapes, so that motion between checked samples is covered too; returns them.
 
     Changing a shape drops the filters Drake had set for it (same body, adjacent bodies): the caller excludes the
     robot's own pairs again.
@@ -251,6 +297,7 @@ def _pad(
     source = plant.get_source_id()
     inspector = scene_graph.model_inspector()
     gripper = set(robot.model.gripper.bodies) if robot.model.gripper else set()
+    out = []
     for index in plant.GetBodyIndices(instance):
         body = plant.get_body(index)
         if body.name() in gripper or body.name() == robot.model.base:
@@ -268,6 +315,8 @@ def _pad(
                 grown = Box(*(shape.size() + 2 * extra))
             if grown is not None:
                 scene_graph.ChangeShape(source, g, grown)
+                out.append(g)
+    return out
 
 
 def chain_of(scene: Scene, name: str) -> tuple[Chain, Tool]:

@@ -16,14 +16,15 @@ from pydrake.geometry import (
     MeshcatVisualizerParams,
     Rgba,
     Role,
+    Sphere,
 )
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 
 from mrtamp.modes import start_mode
 from mrtamp.playback import Playback, standstill, static_poses
-from mrtamp.problem import AtPose, InRegion, Problem, Support
-from mrtamp.scene import build_scene
+from mrtamp.problem import AtConfiguration, AtPose, HandAt, HandIn, InRegion, Problem, Support
+from mrtamp.scene import build_scene, chain_of
 
 PALETTE: tuple[tuple[float, float, float], ...] = (
     (0.00, 0.45, 0.70),
@@ -42,6 +43,7 @@ SCENE, REGIONS, GHOSTS, TRACES = (f"{ROOT}/{part}" for part in ("scene", "region
 _MARKS = f"{ROOT}/marks"
 _TRACE_RADIUS = 0.0025
 _REGION_THICKNESS = 0.0012
+_TARGET_RADIUS = 0.03
 _FIELD_OF_VIEW = 35.0
 
 
@@ -79,6 +81,7 @@ class Stage:
         self.show(Playback(standstill(problem)).positions(self.scene, np.zeros(1))[0])
         self._draw_regions()
         self._draw_ghosts()
+        self._draw_targets()
         self._draw_robot_marks()
         self._set_lights()
         self.look()
@@ -116,9 +119,10 @@ class Stage:
 
     def look(self) -> None:
         """Point the camera at the robots, from a side where no robot stands in front of the others."""
-        bases = np.array([r.X_WB.translation() for r in self.problem.robots])
+        bases = self._stands()
         centre = (bases.min(axis=0) + bases.max(axis=0)) / 2
-        spread = np.linalg.norm(bases - centre, axis=1).max()
+        targets = [X[:3, 3] for _, robot, X in self._targets() if self._slides(robot)]
+        spread = np.linalg.norm(np.array([*bases, *targets]) - centre, axis=1).max()
         azimuth = _open_side(bases - centre)
         elevation = 0.5 if len(bases) < 3 else 0.7
         direction = np.array([np.cos(azimuth), np.sin(azimuth), elevation])
@@ -180,16 +184,58 @@ class Stage:
             return None
         return RigidTransform([0, 0, sum(shape.half_height for shape in shapes if shape is not None)])
 
+    def _slides(self, robot: str) -> bool:
+        """Whether a robot moves from place to place: its first joint is prismatic."""
+        model = self.problem.robot(robot).model
+        first = self.scene.plant.GetJointByName(model.arm_joints[0], self.scene.robots[robot].instance)
+        return bool(first.type_name() == "prismatic")
+
+    def _stands(self) -> np.ndarray:
+        """Where the robots stand (R, 3): their bases, and of one that slides where its grasp frame starts."""
+        out = np.array([r.X_WB.translation() for r in self.problem.robots])
+        for k, robot in enumerate(self.problem.robots):
+            if self._slides(robot.name):
+                out[k, :2] = self._X_WG(robot.name, robot.start)[:2, 3]
+        return out
+
+    def _X_WG(self, robot: str, q: np.ndarray) -> np.ndarray:
+        X_WG: np.ndarray = chain_of(self.scene, robot)[1].matrix(np.asarray(q, dtype=float)[None])[0]
+        return X_WG
+
+    def _targets(self) -> list[tuple[str, str, np.ndarray]]:
+        """Subgoal, robot, and where (4, 4) its grasp frame is at the target: of a box, the middle."""
+        out = []
+        for subgoal in self.problem.subgoals:
+            for robot, target in subgoal.targets.items():
+                if isinstance(target, AtConfiguration):
+                    X = self._X_WG(robot, target.q)
+                else:
+                    X = (target.X_WG if isinstance(target, HandAt) else target.X_WC).GetAsMatrix4()
+                out.append((subgoal.name, robot, X))
+        return out
+
+    def _draw_targets(self) -> None:
+        """A translucent ball, or the box, wherever a subgoal wants a robot's hand, in the robot's colour."""
+        for subgoal, robot, X_WT in self._targets():
+            target = self.problem.subgoal(subgoal).targets[robot]
+            flat = 2 * _TRACE_RADIUS
+            box = Box(*np.maximum(target.size, flat)) if isinstance(target, HandIn) else None
+            path = f"{GHOSTS}/{subgoal}/{robot}"
+            color = Rgba(*robot_color(self.problem, robot), 0.45)
+            self.meshcat.SetObject(path, box or Sphere(_TARGET_RADIUS), color)
+            self.meshcat.SetTransform(path, X_WT)
+
     def _draw_robot_marks(self) -> None:
         """A coloured disc under every robot, the colour of its trace and of its name in the timeline."""
-        for robot in self.problem.robots:
+        for robot, stand in zip(self.problem.robots, self._stands(), strict=True):
             path = f"{_MARKS}/{robot.name}"
             self.meshcat.SetObject(path, Cylinder(0.13, 0.004), Rgba(*robot_color(self.problem, robot.name)))
-            self.meshcat.SetTransform(path, robot.X_WB @ RigidTransform([0, 0, 0.002]))
+            R_WB = robot.X_WB.rotation()
+            self.meshcat.SetTransform(path, RigidTransform(R_WB, stand) @ RigidTransform([0, 0, 0.002]))
 
     def _set_lights(self) -> None:
         """Soft light all around and one lamp above that casts the shadows."""
-        bases = np.array([r.X_WB.translation() for r in self.problem.robots])
+        bases = self._stands()
         centre = bases.mean(axis=0)
         height = 3.0 + np.linalg.norm(bases - centre, axis=1).max()
         put = self.meshcat.SetProperty

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from mrtamp.intra_orbit.lazy_validate import step_is_valid
 from mrtamp.modes import Mode
 from mrtamp.roadmap import Roadmap, lazy_path
 from mrtamp.tensor_tree import At, Node, as_mapping
@@ -40,7 +41,7 @@ class Steering:
         self.index = {g.name: i for i, g in enumerate(roadmaps)}
         self.trouble: Counter[tuple[str, str]] = Counter()
 
-    def drive(self, node: Node, targets: dict[str, int], depth: int = 1) -> Node | None:
+    def drive(self, node: Node, targets: Mapping[str, int], depth: int = 1) -> Node | None:
         """Bring robots to target vertices, one after another, others standing; None if some cannot get there.
 
         Robots in the way are first sent aside, up to `depth` levels deep.  Orders of the active robots are tried in
@@ -148,19 +149,5 @@ class Steering:
         return self.insert(node, new)
 
     def step_is_valid(self, mode: Mode, a: At, b: At) -> bool:
-        """LazyValidate: one synchronous step, robots alone first, then every pair of which one moves."""
-        names = [g.name for g in self.roadmaps]
-        moving = [i for i in range(len(a)) if a[i] != b[i]]
-        for i in moving:
-            if not self.validity.edge(names[i], self.roadmaps[i].edge(a[i], b[i]), mode):
-                return False
-        for i in moving:
-            for j in range(len(a)):
-                if j == i or (j in moving and j < i):
-                    continue
-                if j in moving:
-                    if not self.validity.move(mode, names[i], (a[i], b[i]), names[j], (a[j], b[j])):
-                        return False
-                elif not self.validity.against(names[i], self.roadmaps[i].edge(a[i], b[i]), mode, names[j], a[j]):
-                    return False
-        return True
+        """LazyValidate one synchronous step."""
+        return step_is_valid(self.roadmaps, self.validity, mode, a, b)

@@ -55,6 +55,8 @@ class Validity:
         self.roadmaps = roadmaps
         self.counts = collision.counts
         self.X_WB = {WORLD: np.eye(4), **{s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}}
+        self.touching: dict[tuple[str, int], tuple[str, str]] = {}
+        """(robot, vertex) of a subgoal that takes or releases an object -> that object and what it rests on there."""
         self._labels: dict[Hashable, Label] = {}
         self._moves: dict[Hashable, bool] = {}
         self._forbidden: dict[tuple[str, tuple[Attachment, ...]], set[int]] = {}
@@ -161,9 +163,7 @@ class Validity:
         q = roadmap.path_samples(e)
         rows = world.rows(q, held, {item.name: item.X_WO for item, _ in unknown})
         rows = rows[bisection_order(len(rows))]
-        contact, slot = None, None
-        if held is not None and e in roadmap.contact and roadmap.contact[e][0] == held.object:
-            contact, slot = roadmap.contact[e][1], world.slot_of[held.object]
+        contact, slot = self._contact(roadmap, e, held)
         self.counts.edges_validated += 1
         i = world.first_hit(rows, contact, slot)
         if i < 0:
@@ -178,6 +178,15 @@ class Validity:
         if not guilty:
             static.put(e, False)
         return False
+
+    def _contact(self, roadmap: Roadmap, e: int, held: Attachment | None) -> tuple[str | None, str | None]:
+        """The body that the load may touch along an edge that ends where it is lifted or put down, and its slot."""
+        if held is None:
+            return None, None
+        item, body = roadmap.contact.get(e, (None, None))
+        for v in roadmap.ends[e].tolist() if item is None else ():
+            item, body = self.touching.get((roadmap.name, v), (item, body))
+        return (body, roadmap.world.slot_of[item]) if item == held.object else (None, None)
 
     def against(self, robot: str, e: int, mode: Mode, other: str, v: int) -> bool:
         """Whether the robot may move along edge e while `other` stands at its vertex v."""

@@ -18,30 +18,27 @@ class Candidate:
 
     `at` maps each active robot to its contact vertex.  `base` is the chain of attachments of the object it is placed
     on or picked from (empty for a static body): the candidate exists only while that object is there.  `promising` is
-    the sampler's guess that what is gained can be put down at its goal; guidance prefers such candidates.
+    the sampler's guess that what is gained can be put down at its goal; guidance prefers such candidates.  `subgoal` is
+    what a reach candidate reaches.
     """
 
     kind: str
     robots: tuple[str, ...]
     at: Mapping[str, int]
-    before: Attachment
-    after: Attachment
+    before: Attachment | None
+    after: Attachment | None
     base: tuple[Attachment, ...] = ()
     promising: bool = True
-
-    @property
-    def object(self) -> str:
-        """The object that changes hands."""
-        return self.after.object
+    subgoal: str | None = None
 
     @property
     def action(self) -> Action:
-        """The change of attachment, without the vertices."""
-        return Action(self.kind, self.robots, self.before, self.after)
+        """The change of mode, without the vertices."""
+        return Action(self.kind, self.robots, self.before, self.after, self.subgoal)
 
 
 StratumKey = tuple[str, tuple[str, ...], str, str]
-"""Kind, robots, object, and the place it comes from (pick), goes to (place) or the giver (handover)."""
+"""Kind, robots, object, and the place it comes from (pick), goes to (place), the giver (handover) or the subgoal."""
 
 
 @dataclass

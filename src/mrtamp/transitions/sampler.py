@@ -20,6 +20,7 @@ from mrtamp.transitions.candidate import Candidate, Outcome
 from mrtamp.transitions.contacts import ContactBuilder
 from mrtamp.transitions.families import FixedFamily, placement_families
 from mrtamp.transitions.meetings import Meetings
+from mrtamp.transitions.reach import ReachSampler
 from mrtamp.transitions.stratum import Stratum
 from mrtamp.transitions.workspace import Workspace
 from mrtamp.validity import Validity
@@ -50,6 +51,7 @@ class TransitionSampler(Workspace):
         super().__init__(problem, collision, roadmaps, validity, rng)
         self.contacts = ContactBuilder(self)
         self.meetings = Meetings(self)
+        self.reaching = ReachSampler(self)
         self._picks: dict[tuple[str, tuple[Attachment, ...]], list[Candidate]] = {}
         self._places: dict[tuple[str, Attachment], list[Candidate]] = {}
         self._handovers: dict[tuple[Attachment, str], list[Candidate]] = {}
@@ -87,7 +89,7 @@ class TransitionSampler(Workspace):
         return [
             c
             for c in found
-            if (support is None or c.after.support == support)
+            if (support is None or (c.after is not None and c.after.support == support))
             and (not c.base or (not mode.of[c.base[0].object].held and c.base == mode.chain(c.base[0].object)))
         ]
 
@@ -109,7 +111,7 @@ class TransitionSampler(Workspace):
         before = dict(stats.collisions)
         parts, grasps = [], []
         for _ in range(_ROUNDS):
-            drawn = self._draw(robot, strata, n, stats)
+            drawn = self.draw(robot, strata, n, stats)
             if drawn is None:
                 break
             q, family, c = drawn
@@ -136,12 +138,12 @@ class TransitionSampler(Workspace):
             self._roomiest[robot, item] = max(self._roomiest.get((robot, item), 0.0), float(room.max()))
             promising = room >= _ROOMY * self._roomiest[robot, item]
             near = near - 30.0 * room
-        order = self._mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON))
+        order = self.mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON))
         out: list[Candidate] = []
         for i in order[: 4 * keep]:
             v = self.contacts.contact(robot, placement, chain, grasps[i], q[i], stats, mode)
             if v is not None:
-                candidate, _ = self._register(robot, v, placement, grasps[i], chain[1:], bool(promising[i]))
+                candidate, _ = self.register(robot, v, placement, grasps[i], chain[1:], bool(promising[i]))
                 out.append(candidate)
                 stats.accepted += 1
                 if len(out) == keep:
@@ -161,20 +163,20 @@ class TransitionSampler(Workspace):
         if not strata or (on_object and mode.of[body].held):
             return []
         before = dict(stats.collisions)
-        drawn = self._draw(robot, strata, n, stats)
+        drawn = self.draw(robot, strata, n, stats)
         if drawn is None:
             return []
         q, family, c = drawn
         base = mode.chain(body) if on_object else ()
-        order = self._mixed_order(np.linalg.norm(q - self.roadmaps[robot].world.home, axis=1))
+        order = self.mixed_order(np.linalg.norm(q - self.roadmaps[robot].world.home, axis=1))
         out: list[Candidate] = []
         for i in order[: 4 * keep]:
             fixed = isinstance(strata[family[i]].family, FixedFamily)
             X_BO = strata[family[i]].family.pose(c[i][None])[0]
-            placement = self._placement(item, body, support, X_BO, fixed)
+            placement = self.placement(item, body, support, X_BO, fixed)
             v = self.contacts.contact(robot, placement, (placement, *base), grasp, q[i], stats, mode)
             if v is not None:
-                _, candidate = self._register(robot, v, placement, grasp, base)
+                _, candidate = self.register(robot, v, placement, grasp, base)
                 out.append(candidate)
                 stats.accepted += 1
                 if len(out) == keep:
@@ -213,7 +215,7 @@ class TransitionSampler(Workspace):
         promising = np.isfinite(reward)
         if not self.meetings.pools.get((receiver, item)):
             promising[:] = True
-        order = self._mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON))
+        order = self.mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON))
         # Of those that cannot be put down where they belong afterwards, a few are enough.
         order = np.concatenate([order[promising[order]][: 4 * keep], order[~promising[order]][:2]])
         for k in order:
@@ -235,7 +237,7 @@ class TransitionSampler(Workspace):
         names = [n for n, k in stats.collisions.items() if n in mode.of and k > before.get(n, 0)]
         stats.blockers = {mode.of[n] for n in names if not mode.of[n].held}
 
-    def _register(
+    def register(
         self,
         robot: str,
         v: int,
@@ -253,7 +255,7 @@ class TransitionSampler(Workspace):
 
     # -- steps ----------------------------------------------------------------------------------------------------
 
-    def _draw(
+    def draw(
         self, robot: str, strata: Sequence[Stratum], n: int, stats: Outcome
     ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]] | None:
         """n samples over `strata` with constant base: solved configurations, stratum index, choices."""
@@ -281,7 +283,7 @@ class TransitionSampler(Workspace):
         rows = np.flatnonzero(solved)
         return q[rows], family[rows], [choices[i] for i in rows]
 
-    def _mixed_order(self, score: np.ndarray) -> np.ndarray:
+    def mixed_order(self, score: np.ndarray) -> np.ndarray:
         """Mostly the lowest scores first, every third one drawn at random, so that no sample is excluded."""
         ranked = np.argsort(score, kind="stable")
         shuffled = self.rng.permutation(len(score))
@@ -296,7 +298,8 @@ class TransitionSampler(Workspace):
             out.append(i)
         return np.array(out, dtype=int)
 
-    def _placement(self, item: str, body: str, support: str, X_BO: np.ndarray, fixed: bool) -> Attachment:
+    def placement(self, item: str, body: str, support: str, X_BO: np.ndarray, fixed: bool) -> Attachment:
+        """An attachment that rests on a support; the same one every time where the pose is exact (`fixed`)."""
         if not fixed:
             return Attachment(item, body, X_BO, support)
         key = (item, support)

@@ -1,0 +1,212 @@
+"""Growing the tensor tree through transitions: towards sampled ones, along whole skeletons, and to the goal.
+
+Motion inside an orbit is the business of the intra-orbit planner; here modes change, goal nodes are noted, and the
+tree is repaired where the judge refuted it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mrtamp.check import Report
+from mrtamp.check_report import Violation
+from mrtamp.graphs import Graphs
+from mrtamp.modes import Mode, goal_mode
+from mrtamp.plan import Transition, without_detours
+from mrtamp.problem import MrtampError, Problem, RobotAt
+from mrtamp.roadmap import Roadmap
+from mrtamp.steering import Steering
+from mrtamp.tensor_tree import At, Node, TensorTree
+from mrtamp.transitions.candidate import Candidate
+from mrtamp.validity import Validity
+
+if TYPE_CHECKING:
+    from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
+
+Combination = tuple[Candidate, ...]
+"""Elementary transitions of disjoint robots that happen at the same instant."""
+
+
+class Growth:
+    """The tensor tree with its orbits, and every way in which it grows or is cut back.
+
+    Attributes
+    ----------
+    goal_nodes : nodes that satisfy the goal.
+    goal_vertices : robot -> the vertex where it has to end.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        roadmaps: Mapping[str, Roadmap],
+        validity: Validity,
+        rng: np.random.Generator,
+    ) -> None:
+        self.problem = problem
+        self.roadmaps = roadmaps
+        self.names = list(roadmaps)
+        self.validity = validity
+        self.rng = rng
+        self.counts = validity.counts
+        self.graphs = Graphs()
+        self.tree = TensorTree(list(roadmaps.values()), problem.cost)
+        self.steering = Steering(list(roadmaps.values()), validity, self._insert, rng)
+        self.goal_vertices: dict[str, int] = {}
+        self.goal_nodes: list[Node] = []
+        self._banned: set[tuple] = set()
+
+    def start(self, mode: Mode) -> Node:
+        """The root: every robot at its start; final configurations become vertices too."""
+        at = []
+        for robot in self.problem.robots:
+            roadmap = self.roadmaps[robot.name]
+            at.append(roadmap.add_vertex(robot.start))
+            if np.max(np.abs(robot.home - robot.start)) > 0:
+                roadmap.add_vertex(robot.home)
+            for condition in self.problem.goal:
+                if isinstance(condition, RobotAt) and condition.robot == robot.name:
+                    same = np.flatnonzero(np.max(np.abs(roadmap.q - condition.q), axis=1) == 0)
+                    self.goal_vertices[robot.name] = int(same[0]) if len(same) else roadmap.add_vertex(condition.q)
+        root = self.tree.add_root(mode, tuple(at), self.graphs.add_orbit(mode))
+        self.note_goal(root)
+        return root
+
+    # -- one transition -------------------------------------------------------------------------------------------
+
+    def towards(self, near: Node, combination: Combination) -> Node | None:
+        """Drive the active robots to their transition vertices and change the mode there; the node after it."""
+        node = self.steering.drive(near, {r: v for c in combination for r, v in c.at.items()})
+        return None if node is None else self._change_mode(node, combination)
+
+    def _change_mode(self, node: Node, combination: Combination) -> Node | None:
+        transition = Transition(tuple(c.action for c in combination))
+        mode = node.mode.after(transition)
+        if (mode.key, node.at) in self._banned:
+            return None
+        if self.validity.stand(mode, dict(zip(self.names, node.at, strict=True)), transition.active) is not None:
+            return None
+        cost = sum(self.problem.cost.transitions.get(c.kind, 0.0) for c in combination)
+        known = self.tree.find(mode, node.at)
+        if known is not None and known.cost <= node.cost + cost:
+            return known
+        orbit = self.graphs.add_orbit(mode) if known is None else None
+        after = self.tree.insert_transition(node, transition, mode, orbit, cost)
+        self.graphs.transition(node.orbit, after.orbit)
+        self.note_goal(after)
+        return after
+
+    def taken(self, mode: Mode, candidate: Candidate) -> bool:
+        """Whether the tree has the mode that a candidate leads to."""
+        return self.tree.entry(mode.after(Transition((candidate.action,)))) is not None
+
+    # -- whole skeletons ------------------------------------------------------------------------------------------
+
+    def realise(self, proposal: Proposal, skeletons: SkeletonGuidance, root: Node) -> Node | None:
+        """Extend the tree along a skeleton, robots that are idle or done stepping aside; the goal node, or None.
+
+        The stop at which it ends is reported to the guidance.
+        """
+        node = root
+        for stop, way in proposal.stops:
+            candidate = skeletons.candidate(stop, node.mode)
+            after = None if candidate is None else self.towards(node, (candidate,))
+            if after is None:
+                skeletons.failed(way)
+                return None
+            node = after
+        return self.towards_goal(node) if self.is_goal_mode(node.mode) else None
+
+    def without_detours(self, root: Node, solution: Node) -> None:
+        """Extend the tree by a solution without the picks that were put back where they came from."""
+        steps = [x for x in self.tree.branch(solution) if x.transition is not None]
+        kept = without_detours([x.transition.actions for x in steps if x.transition is not None])
+        if len(kept) == len(steps):
+            return
+        at = root
+        for k in kept:
+            transition = steps[k].transition
+            assert transition is not None
+            vertices = dict(zip(self.names, steps[k].at, strict=True))
+            combination = tuple(
+                Candidate(a.kind, a.robots, {r: vertices[r] for r in a.robots}, a.before, a.after, subgoal=a.subgoal)
+                for a in transition.actions
+            )
+            after = self.towards(at, combination)
+            if after is None:
+                return
+            at = after
+        if self.goal_vertices and self.is_goal_mode(at.mode):
+            self.towards_goal(at)
+
+    # -- goal -----------------------------------------------------------------------------------------------------
+
+    def is_goal_mode(self, mode: Mode) -> bool:
+        """Whether only robots still have to move."""
+        return goal_mode(self.problem, mode, self.validity.X_WB)
+
+    def towards_goal(self, near: Node) -> Node | None:
+        """In a mode that satisfies the goal, bring the robots to where they have to end; the node there, or None."""
+        for name in [str(x) for x in self.rng.permutation(list(self.goal_vertices))]:
+            near = self.steering.drive(near, {name: self.goal_vertices[name]}) or near
+        # Whoever was sent aside comes back at the end.
+        for name, v in self.goal_vertices.items():
+            near = self.steering.drive(near, {name: v}, depth=0) or near
+        return near if self._is_goal(near) else None
+
+    def _is_goal(self, node: Node) -> bool:
+        at = dict(zip(self.names, node.at, strict=True))
+        return all(at[r] == v for r, v in self.goal_vertices.items()) and self.is_goal_mode(node.mode)
+
+    def note_goal(self, node: Node) -> None:
+        """Remember a node that satisfies the goal."""
+        if self._is_goal(node):
+            self.goal_nodes.append(node)
+
+    def _insert(self, node: Node, at: At) -> Node:
+        """InsertAndRewire: a validated step; orbits that it proves connected become one."""
+        new, is_new = self.tree.insert(node, at)
+        if not is_new and new.orbit != node.orbit:
+            kept = self.graphs.merge(new.orbit, node.orbit)
+            self.tree.merge_orbits(kept, new.orbit if new.orbit != kept else node.orbit)
+        self.counts.nodes = len(self.tree.nodes)
+        if is_new:
+            self.note_goal(new)
+        return new
+
+    # -- repair ---------------------------------------------------------------------------------------------------
+
+    def repair(self, report: Report, groups: list[list[Node]]) -> None:
+        """The judge found what samples had missed: forbid that step, or that change of mode, and cut the tree there."""
+        for violation in report.violations:
+            if violation.kind not in ("collision", "contact") or violation.segment is None:
+                raise MrtampError(f"the planner produced an illegal plan; please report this: {violation}")
+            group = groups[violation.segment]
+            step = violation.step or 0
+            at_end = step >= len(group) - 2 and (violation.fraction or 0.0) > 0.999
+            if at_end and violation.segment + 1 < len(groups):
+                # Fingers that close or open at the transition may be the cause.
+                after = groups[violation.segment + 1][0]
+                self._banned.add((after.mode.key, after.at))
+                if after.alive:
+                    self.tree.cut(after)
+            if step + 1 < len(group):
+                before, after = group[step], group[step + 1]
+                guilty, obstacle = self._guilty(violation, before)
+                one, two = (dict(zip(self.names, x.at, strict=True)) for x in (before, after))
+                self.validity.forbid(before.mode, one, two, guilty, obstacle)
+                if after.alive:
+                    self.tree.cut(after)
+
+    def _guilty(self, violation: Violation, node: Node) -> tuple[tuple[str, ...], str | None]:
+        """The one or two robots that a violation is about, counting loads with their carriers, and what one hit."""
+        carriers = {a.object: r for r, a in node.mode.held.items()}
+        owners = [carriers.get(s.owner, s.owner) for s in violation.sides or ()]
+        robots = tuple(dict.fromkeys(o for o in owners if o in self.roadmaps))
+        obstacles = [o for o in owners if o not in self.roadmaps]
+        if robots and violation.kind == "collision":
+            return robots, obstacles[0] if obstacles else robots[0]
+        return robots or tuple(self.names[:1]), None

@@ -1,0 +1,160 @@
+"""The optimiser's own judge: yes-or-no collision queries at samples as fine as the planner's own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrtamp.collision import RESOLUTION
+from mrtamp.optimise.choices import Arrangement
+from mrtamp.optimise.nearness import CULL, Nearness, Samples
+from mrtamp.optimise.polyline import Polyline, Stretch
+
+_SLIVER = 1e-9
+
+Who = tuple[str, ...]
+"""One robot (with its load against the world), or two (against each other)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Violations:
+    """Samples in collision, and who: a robot alone or two robots."""
+
+    who: Who
+    samples: Samples
+
+
+def contact_of(stretches: Sequence[Stretch], robot: str, samples: Samples) -> np.ndarray:
+    """What the robot's load may touch at every sample (S,): the name of a thing, or ''."""
+    out = np.full(len(samples), "", dtype=object)
+    time = samples.lo + samples.t
+    for s in stretches:
+        if s.robot == robot and s.hand == "lifting" and s.support is not None:
+            if s.before:
+                inside = (time >= s.far - _SLIVER) & (samples.segment <= s.event)
+            else:
+                inside = (time <= s.far + _SLIVER) & (samples.segment > s.event)
+            out[inside] = s.support
+    return out
+
+
+class FineCheck:
+    """Checks polylines at the planner's resolution."""
+
+    def __init__(self, nearness: Nearness, resolution: float = RESOLUTION) -> None:
+        self.nearness = nearness
+        self.resolution = resolution
+
+    def samples(self, line: Polyline, q: np.ndarray) -> Samples:
+        """Samples between which no tracked point of any robot moves further than the resolution, transitions twice."""
+        travel = np.zeros(line.knots - 1)
+        for robot, columns in line.columns.items():
+            world = self.nearness.worlds[robot]
+            x = q[:, columns]
+            own = world.bounds.spheres(x)
+            R, p = world.tool.pose(x)
+            hand = p[:, None] + np.einsum("nij,kj->nki", R, 0.1 * np.eye(3))
+            for points in (own, hand):
+                travel = np.maximum(travel, np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1))
+        pieces = np.maximum(1, np.ceil(1.1 * travel / self.resolution)).astype(int)
+        return knot_samples(line, pieces)
+
+    def violations(self, line: Polyline, q: np.ndarray, arrangement: Arrangement) -> list[Violations]:
+        """All samples in collision; pairs of configurations that the problem or the transitions fix are not asked."""
+        samples = self.samples(line, q)
+        names = list(line.columns)
+        x = {r: samples.at(q[:, line.columns[r]]) for r in names}
+        spheres = {r: self.nearness.spheres(r, x[r], arrangement.modes, samples.segment) for r in names}
+        out = []
+        for i, robot in enumerate(names):
+            hits = self._world(line, robot, x[robot], samples, arrangement, spheres[robot])
+            if len(hits):
+                out.append(Violations((robot,), samples[hits]))
+            for other in names[:i]:
+                hits = self._pair(other, robot, x, samples, arrangement, spheres)
+                if len(hits):
+                    out.append(Violations((other, robot), samples[hits]))
+        return out
+
+    def _world(
+        self, line: Polyline, robot: str, x: np.ndarray, samples: Samples, arrangement: Arrangement, spheres: tuple
+    ) -> np.ndarray:
+        world = self.nearness.worlds[robot]
+        contact = contact_of(line.stretches, robot, samples)
+        hits: list[int] = []
+        for s in np.unique(samples.segment).tolist():
+            mode = arrangement.modes[s]
+            held = mode.held.get(robot)
+            slot = world.slot_of[held.object] if held else None
+            here = np.flatnonzero(samples.segment == s)
+            # Who stands still is looked at once.
+            fresh = np.concatenate([[True], np.abs(np.diff(x[here], axis=0)).max(axis=1) > 0])
+            here = here[fresh]
+            rows = self.nearness.rows(
+                robot, x[here], held, arrangement.resting(mode), (spheres[0][here], spheres[1][here]), CULL
+            )
+            for touch in set(contact[here]):
+                mine = np.flatnonzero(contact[here] == touch)
+                found = here[mine[_all_hits(lambda r: world.first_hit(r, touch or None, slot), rows[mine])]]  # noqa: B023
+                hits += found.tolist()
+        return np.array(sorted(hits), dtype=int)
+
+    def _pair(
+        self, a: str, b: str, x: dict[str, np.ndarray], samples: Samples, arrangement: Arrangement, spheres: dict
+    ) -> np.ndarray:
+        close = self.nearness.close((spheres[a], spheres[b]), CULL)
+        if not len(close):
+            return close
+        still = np.concatenate([[False], np.all(x[a][1:] == x[a][:-1], axis=1) & np.all(x[b][1:] == x[b][:-1], axis=1)])
+        same = np.concatenate([[False], np.diff(samples.segment) == 0])
+        close = close[~(still & same)[close]]
+        pair, swapped = self.nearness.collision.pair(a, b)
+        hits: list[int] = []
+        for s in np.unique(samples.segment[close]).tolist():
+            i = close[samples.segment[close] == s]
+            held_a, held_b = (arrangement.modes[s].held.get(r) for r in (a, b))
+            exact = (samples.t[i] == 0) | (samples.t[i] == 1)
+            one, two = (x[a][i], held_a), (x[b][i], held_b)
+            first, second = (two, one) if swapped else (one, two)
+
+            def ask(k: np.ndarray) -> int:
+                return pair.first_hit(first[0][k], first[1], second[0][k], second[1], exact=exact[k])  # noqa: B023
+
+            hits += i[_all_hits(ask, np.arange(len(i)))].tolist()
+        return np.array(sorted(hits), dtype=int)
+
+
+def _all_hits(first_hit, rows: np.ndarray) -> np.ndarray:
+    """All rows for which a query that returns the first hit, or -1, finds one."""
+    out, start = [], 0
+    while start < len(rows):
+        k = first_hit(rows[start:])
+        if k < 0:
+            break
+        out.append(start + k)
+        start += k + 1
+    return np.array(out, dtype=int)
+
+
+def knot_samples(line: Polyline, pieces: np.ndarray) -> Samples:
+    """`pieces` (K - 1,) samples per step and its end; knots of transitions belong to both segments."""
+    of_step = line.segment_of_step
+    lo = np.repeat(np.arange(line.knots - 1), pieces)
+    t = np.concatenate([np.zeros(0), *(np.arange(n) / n for n in pieces.tolist())])
+    if line.knots == 1:
+        segments = np.arange(len(line.events) + 1)
+        return Samples(np.zeros(len(segments), int), np.zeros(len(segments)), segments)
+    ends = np.unique([line.knots - 1, *line.events.tolist()])
+    ends = ends[ends > 0]
+    # Segments of one waypoint, and the start of the motion right after a transition at the first knot.
+    short = [s for s in range(len(line.events) + 1) if s not in set(of_step.tolist())]
+    knots = [int(line.events[min(s, len(line.events) - 1)]) for s in short]
+    lo_s = np.minimum(knots, line.knots - 2).astype(int)
+    t_s = np.array(knots, dtype=float) - lo_s
+    all_lo = np.concatenate([lo, ends - 1, lo_s])
+    all_t = np.concatenate([t, np.ones(len(ends)), t_s])
+    segment = np.concatenate([of_step[lo], of_step[ends - 1], np.array(short, dtype=int)])
+    order = np.lexsort((all_lo + all_t, segment))
+    return Samples(all_lo[order].astype(int), all_t[order], segment[order].astype(int))

@@ -1,0 +1,402 @@
+"""Sequential convex programming on a whole plan: the loop that ties programs, projections and checks together.
+
+Each step solves one conic program in a trust region around the current polyline, projects transitions back onto their
+strata, checks the result as finely as the planner does, and keeps it if it is cheaper and free of collision
+(DESIGN section 8).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from mrtamp.check_report import Report, Violation
+from mrtamp.collision import Collision
+from mrtamp.optimise.choices import Arrangement, Choices
+from mrtamp.optimise.closure import Closure, independent
+from mrtamp.optimise.fine import FineCheck, Violations, Who, contact_of, knot_samples
+from mrtamp.optimise.nearness import Near, Nearness, Samples
+from mrtamp.optimise.polyline import Polyline, load
+from mrtamp.optimise.program import PENALTY, Linearised, Reduction, reduce, solve
+from mrtamp.optimise.pins import pins
+from mrtamp.plan import Segment, Transition
+from mrtamp.problem import Problem
+from mrtamp.transitions.families import GraspFamily
+
+TRUST = 0.2
+"""First radius (rad) of the trust region of every joint."""
+_LARGEST, _SMALLEST = 0.4, 0.01
+_DEEP = 0.03
+"""Penetration (m) at which a step is rejected."""
+_NEAR = 0.06
+"""Distance (m) below which pairs of solids enter the program."""
+_MARGIN = 1.5e-3
+"""Clearance (m) that the program asks for at its samples."""
+_STRICTER = 1e-3
+_TOUCHING = -3e-4
+"""Clearance (m) asked of an object and what it is lifted off or put on."""
+_GOOD, _STALL = 0.01, 0.001
+_PATIENCE = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Iterate:
+    """A polyline and what is attached to what along it."""
+
+    line: Polyline
+    q: np.ndarray
+    arrangement: Arrangement
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Collisions:
+    """Linearised distances at an iterate: A (P, K * N + coordinates) and how far (P,) each may shrink."""
+
+    A: sparse.csr_array
+    gap: np.ndarray
+    deepest: float
+
+
+class Optimiser:
+    """Improves one plan: same order of events, same homotopy, but everything else may move.
+
+    Parameters
+    ----------
+    segments, transitions : a valid plan.
+    families : (robot, object) -> grasp families within which grasps may slide.
+    knot : length (rad) of the steps of the polyline.
+    slide : whether transitions may slide along their strata; otherwise their configurations stay as they are.
+
+    Attributes
+    ----------
+    cost : cost of the best polyline without violations, transitions included.
+    steps : conic programs solved so far.
+    converged : whether further steps promise nothing.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        collision: Collision,
+        segments: Sequence[Segment],
+        transitions: Sequence[Transition],
+        families: Mapping[tuple[str, str], Sequence[GraspFamily]],
+        *,
+        knot: float = 0.27,
+        slide: bool = True,
+    ) -> None:
+        self.problem = problem
+        self.weights = problem.cost
+        self.worlds = collision.worlds
+        self.nearness = Nearness(collision)
+        self.fine = FineCheck(self.nearness)
+        self.knot = knot
+        self.slide = slide
+        self.steps = 0
+        self.trust = TRUST
+        self.converged = False
+        self._stalls = 0
+        self._extra: dict[Who, dict[tuple[int, float, int], int]] = {}
+        self._changes = sum(self.weights.transitions.get(a.kind, 0.0) for t in transitions for a in t.actions)
+        self.choices = Choices(problem, [s.mode for s in segments], transitions, families if slide else {})
+        if not slide:
+            self.choices.freeze()
+        line = load(segments, transitions, {r: w.tool for r, w in self.worlds.items()})
+        self._best = self._sure = self._iterate(line, line.q, self.choices.at(self.choices.start))
+        self._now = self._best
+        self._resample()
+        self._collisions: _Collisions | None = None
+
+    # -- the result -------------------------------------------------------------------------------------------------
+
+    @property
+    def cost(self) -> float:
+        """Cost of the best iterate."""
+        return self._best.cost
+
+    @property
+    def transitions(self) -> list[Transition]:
+        """Transitions of the best iterate."""
+        return self._best.arrangement.transitions
+
+    def segments(self) -> list[Segment]:
+        """Segments of the best iterate."""
+        parts = self._best.line.parts(self._best.q)
+        return [Segment(mode, q) for mode, q in zip(self._best.arrangement.modes, parts, strict=True)]
+
+    def confirm(self) -> None:
+        """The judge accepted the best iterate: `tighten` will not go back behind it."""
+        self._sure = self._best
+
+    def tighten(self, report: Report) -> None:
+        """The judge refused the best iterate: ask for more clearance where it collided, and go on from there."""
+        refused = self._best
+        self._best, self.converged, self._stalls = self._sure, False, 0
+        self._now, self._collisions = refused, None
+        self._adopt(refused.line)
+        bounds = [0, *refused.line.events.tolist()]
+        for violation in report.violations:
+            who = self._guilty(violation, refused.arrangement)
+            if who and violation.kind == "collision":
+                s = violation.segment or 0
+                lo = min(bounds[s] + (violation.step or 0), refused.line.knots - 2)
+                self._demand(who, lo, violation.fraction or 0.0, s, 2)
+            elif self.slide:
+                # Not a matter of clearance: leave transitions as they were.
+                self._fix()
+                return
+
+    def _guilty(self, violation: Violation, arrangement: Arrangement) -> Who:
+        held = arrangement.modes[violation.segment or 0].held
+        carrier = {a.object: r for r, a in held.items()}
+        owners = [carrier.get(s.owner, s.owner) for s in violation.sides or ()]
+        return tuple(dict.fromkeys(r for r in self.worlds if r in owners))
+
+    def _fix(self) -> None:
+        """Start again from the last confirmed iterate with transitions that stay as they are."""
+        self.slide = False
+        self.choices = self._sure.arrangement.frozen()
+        self._extra.clear()
+        self._now = self._iterate(self._sure.line, self._sure.q, self.choices.at(self.choices.start))
+        self._adopt(self._now.line)
+
+    # -- one step ---------------------------------------------------------------------------------------------------
+
+    def step(self) -> float:
+        """Solve one conic program; returns by how much the cost of the best iterate went down."""
+        if self.converged or self._now.line.knots < 2:
+            self.converged = True
+            return 0.0
+        now = self._now
+        if self._collisions is None:
+            self._collisions = self._linearise(now)
+        self.steps += 1
+        candidate = self._solve(now, self._collisions)
+        if candidate is None:
+            return self._reject()
+        violations = self.fine.violations(candidate.line, candidate.q, candidate.arrangement)
+        kept = {who: dict(x) for who, x in self._extra.items()}
+        self._learn(violations)
+        collisions = self._linearise(candidate)
+        if collisions.deepest > _DEEP and collisions.deepest > self._collisions.deepest:
+            self._extra = kept
+            return self._reject()
+        before = self._merit(now, self._collisions)
+        after = self._merit(candidate, collisions)
+        self._now, self._collisions = candidate, collisions
+        gain = 0.0
+        if not violations and candidate.cost < self._best.cost - 1e-9:
+            gain = self._best.cost - candidate.cost
+            self._best = candidate
+        self._pace((before - after) / max(before, 1e-9), gain)
+        lengths = candidate.line.lengths(candidate.q).max(axis=0)
+        if lengths.max() > 1.4 * self.knot or (lengths < 0.1 * self.knot).mean() > 0.4:
+            self._resample()
+        return gain
+
+    def _pace(self, progress: float, gain: float) -> None:
+        if progress > _GOOD:
+            self.trust = min(1.2 * self.trust, _LARGEST)
+        elif progress < _STALL:
+            self.trust *= 0.6
+        self._stalls = self._stalls + 1 if gain < _STALL * self._best.cost and progress < _STALL else 0
+        self.converged = self.trust < _SMALLEST or self._stalls > _PATIENCE
+
+    def _reject(self) -> float:
+        self.trust *= 0.5
+        self.converged = self.trust < _SMALLEST
+        return 0.0
+
+    def _merit(self, x: Iterate, collisions: _Collisions) -> float:
+        return x.cost + PENALTY * float(np.maximum(-collisions.gap, 0.0).sum())
+
+    def _solve(self, now: Iterate, collisions: _Collisions) -> Iterate | None:
+        E, size = self._reduction.E, now.q.size
+        n, count = E.shape[1], self.choices.count
+        scale = self.choices.scale
+        whole = sparse.csr_array(sparse.block_diag([E, sparse.diags_array(scale)])) if count else E
+        lower, upper = self._box(now)
+        equal = self._blocks([(r.columns, r.block, None) for r in self._closure.equalities(now.q, now.arrangement)], whole)
+        more = [(r.columns, r.block, r.lower) for r in self._closure.inequalities(now.q, now.arrangement)]
+        F, g = self._stacked(more, whole)
+        rows = Linearised(
+            sparse.csr_array(collisions.A @ whole), -collisions.gap, equal, F, g, lower, upper
+        )
+        x = solve(self._reduction, now.q, self.weights, rows)
+        if x is None:
+            return None
+        q = now.q + (E @ x[:n]).reshape(now.q.shape)
+        c = np.clip(now.arrangement.c + scale * x[n:], *self.choices.bounds) if count else now.arrangement.c
+        assert q.size == size
+        arrangement = self.choices.at(c) if count else now.arrangement
+        projected = self._closure.project(self._clipped(q), arrangement)
+        return None if projected is None else self._iterate(now.line, self._clipped(projected), arrangement)
+
+    def _box(self, now: Iterate) -> tuple[np.ndarray, np.ndarray]:
+        """Trust region, joint limits and bounds of coordinates."""
+        low, high = self._limits
+        at = now.q[self._reduction.knot, self._reduction.column]
+        column = self._reduction.column
+        lower = np.clip(low[column] - at, -self.trust, 0.0)
+        upper = np.clip(high[column] - at, 0.0, self.trust)
+        if not self.choices.count:
+            return lower, upper
+        least, most = self.choices.bounds
+        c, scale = now.arrangement.c, self.choices.scale
+        return (
+            np.concatenate([lower, np.clip((least - c) / scale, -self.trust, 0.0)]),
+            np.concatenate([upper, np.clip((most - c) / scale, 0.0, self.trust)]),
+        )
+
+    def _blocks(self, parts: list, whole: sparse.csr_array) -> sparse.csr_array:
+        """Equality rows over the independent variables, redundant ones dropped."""
+        out = []
+        for columns, block, _ in parts:
+            reduced = sparse.csr_array(block @ whole[columns])
+            used = np.unique(reduced.indices)
+            if not len(used):
+                continue
+            basis = independent(reduced[:, used].toarray())
+            if len(basis):
+                entries = (basis.reshape(-1), (np.repeat(np.arange(len(basis)), len(used)), np.tile(used, len(basis))))
+                out.append(sparse.csr_array(entries, shape=(len(basis), whole.shape[1])))
+        return sparse.csr_array(sparse.vstack(out)) if out else sparse.csr_array((0, whole.shape[1]))
+
+    def _stacked(self, parts: list, whole: sparse.csr_array) -> tuple[sparse.csr_array, np.ndarray]:
+        if not parts:
+            return sparse.csr_array((0, whole.shape[1])), np.zeros(0)
+        rows = [sparse.csr_array(block @ whole[columns]) for columns, block, _ in parts]
+        return sparse.csr_array(sparse.vstack(rows)), np.concatenate([lower for _, _, lower in parts])
+
+    # -- collisions -------------------------------------------------------------------------------------------------
+
+    def _learn(self, violations: Sequence[Violations]) -> None:
+        """Every violating sample becomes a row of the next programs, stricter each time it recurs."""
+        for v in violations:
+            for lo, t, s in zip(v.samples.lo.tolist(), v.samples.t.tolist(), v.samples.segment.tolist(), strict=True):
+                self._demand(v.who, lo, t, s, 1)
+
+    def _demand(self, who: Who, lo: int, t: float, segment: int, more: int) -> None:
+        rows = self._extra.setdefault(who, {})
+        key = (lo, round(t * 12) / 12, segment)
+        rows[key] = rows.get(key, 0) + more
+
+    def _samples(self, base: Samples, who: Who) -> tuple[Samples, np.ndarray]:
+        """The samples of a query and the clearance (S,) asked for at each."""
+        margin = np.full(len(base), _MARGIN - 0.25 * self.problem.collision.tolerance)
+        extra = self._extra.get(who)
+        if not extra:
+            return base, margin
+        lo, t, segment = (np.array(x) for x in zip(*extra, strict=True))
+        strict = margin[0] + _STRICTER * np.array(list(extra.values()))
+        return base.joined(Samples(lo, t, segment)), np.concatenate([margin, strict])
+
+    def _linearise(self, at: Iterate) -> _Collisions:
+        """Distances and their gradients at knots, midpoints, and wherever something was violated."""
+        line, q, arrangement = at.line, at.q, at.arrangement
+        base = knot_samples(line, np.full(line.knots - 1, 2))
+        blocks: list[sparse.csr_array] = []
+        gaps: list[np.ndarray] = []
+        deepest = 0.0
+        names = list(line.columns)
+        for i, robot in enumerate(names):
+            for who in [(robot,), *((other, robot) for other in names[:i])]:
+                samples, margin = self._samples(base, who)
+                knots = {r: q[:, line.columns[r]] for r in who}
+                if len(who) == 1:
+                    near = self.nearness.world(robot, knots[robot], samples, arrangement, _NEAR)
+                else:
+                    near = self.nearness.between(*who, *knots.values(), samples, arrangement, _NEAR)
+                if not len(near.distance):
+                    continue
+                asked = margin[near.sample]
+                if len(who) == 1:
+                    touching = self._touching(line, robot, samples, near)
+                    asked = np.where(touching, _TOUCHING, asked)
+                deepest = max(deepest, float(-(near.distance - np.minimum(asked, 0)).min()))
+                blocks.append(self._gradient(line, samples, near, knots, arrangement))
+                gaps.append(near.distance - asked)
+        A = sparse.csr_array(sparse.vstack(blocks)) if blocks else sparse.csr_array((0, q.size + self.choices.count))
+        return _Collisions(A, np.concatenate([np.zeros(0), *gaps]), deepest)
+
+    def _touching(self, line: Polyline, robot: str, samples: Samples, near: Near) -> np.ndarray:
+        """Pairs (P,) of a load and what it is being lifted off or put on."""
+        contact = contact_of(line.stretches, robot, samples)
+        number = self.nearness.carriers.number
+        support = np.array(
+            [number.get(("static", c), number.get(("object", c), -2)) if c else -2 for c in contact], dtype=int
+        )[near.sample]
+        held = number["held", robot]
+        return ((near.a == held) & (near.b == support)) | ((near.b == held) & (near.a == support))
+
+    def _gradient(
+        self, line: Polyline, samples: Samples, near: Near, knots: Mapping[str, np.ndarray], arrangement: Arrangement
+    ) -> sparse.csr_array:
+        """Rows over flattened knots and coordinates: a row between two knots involves both."""
+        N = line.q.shape[1]
+        lo, t = samples.lo[near.sample], samples.t[near.sample]
+        P = len(lo)
+        values, rows, columns = [], [], []
+        x = {r: samples.at(k) for r, k in knots.items()}
+        for robot in knots:
+            G = self.nearness.joint_gradient(robot, x[robot], near)
+            cols = line.columns[robot]
+            joint = np.arange(cols.start, cols.stop)
+            for knot, weight in ((lo, 1 - t), (np.minimum(lo + 1, line.knots - 1), t)):
+                values.append((G * weight[:, None]).reshape(-1))
+                rows.append(np.repeat(np.arange(P), len(joint)))
+                columns.append((knot[:, None] * N + joint).reshape(-1))
+        H = self.nearness.choice_gradient(near, samples, x, arrangement)
+        r, k = np.nonzero(H)
+        values.append(H[r, k])
+        rows.append(r)
+        columns.append(line.q.size + k)
+        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+        out = sparse.csr_array(entries, shape=(P, line.q.size + len(arrangement.c)))
+        out.eliminate_zeros()
+        return out
+
+    # -- bookkeeping ------------------------------------------------------------------------------------------------
+
+    def _iterate(self, line: Polyline, q: np.ndarray, arrangement: Arrangement) -> Iterate:
+        lengths = line.lengths(q)
+        if not lengths.size:
+            return Iterate(line, q, arrangement, self._changes)
+        motion = self.weights.makespan * lengths.max(axis=0).sum() + self.weights.path_length * lengths.sum()
+        return Iterate(line, q, arrangement, float(motion) + self._changes)
+
+    def _clipped(self, q: np.ndarray) -> np.ndarray:
+        return np.clip(q, *self._limits)
+
+    @property
+    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
+        chains = [self.worlds[r].chain for r in self._now.line.columns]
+        return np.concatenate([c.lower for c in chains]), np.concatenate([c.upper for c in chains])
+
+    def _resample(self) -> None:
+        """Spread the knots of the current iterate evenly again."""
+        now = self._now
+        line = Polyline(now.line.columns, now.q, now.line.events, now.line.stretches)
+        u = line.resampled(self.knot)
+        fresh = line.at(u)
+        moved: dict[Who, dict[tuple[int, float, int], int]] = {}
+        for who, rows in self._extra.items():
+            moved[who] = {}
+            for (lo, t, segment), strict in rows.items():
+                at = float(np.interp(lo + t, u, np.arange(len(u))))
+                k = min(int(at), max(fresh.knots - 2, 0))
+                moved[who][k, round((at - k) * 12) / 12, segment] = strict
+        self._extra = moved
+        self._now = self._iterate(fresh, fresh.q, now.arrangement)
+        self._collisions = None
+        self._adopt(fresh)
+
+    def _adopt(self, line: Polyline) -> None:
+        """Variables and closure rows for a new set of knots."""
+        pinned = pins(self.problem, line, self._now.arrangement.transitions, self.slide)
+        self._reduction: Reduction = reduce(line, pinned)
+        self._closure = Closure(self.problem, self.worlds, line, self._now.q, pinned)

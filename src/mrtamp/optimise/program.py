@@ -1,0 +1,159 @@
+"""One step of sequential convex programming: which knots may move, and the second-order cone program over them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
+from scipy import sparse
+
+from mrtamp.optimise.polyline import Polyline
+from mrtamp.problem import CostWeights
+
+PENALTY = 20.0
+"""Cost of a metre of penetration, relative to that of a radian of motion."""
+_TINY = 1e-4
+"""Share of the makespan's weight that shapes idle motion where path length has no weight."""
+_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """Displacements of all knots, flattened (K * N,), as E z of independent variables z (n,).
+
+    `knot` (n,) and `column` (n,) say which joint at which knot a variable moves; `cones` holds for every step and robot
+    that can change: row among all lengths, the variables, and the matrix from them to the change of the joint vector.
+    """
+
+    line: Polyline
+    E: sparse.csr_array
+    knot: np.ndarray
+    column: np.ndarray
+    cones: list[tuple[int, np.ndarray, np.ndarray]]
+
+
+def reduce(line: Polyline, pinned: Mapping[str, np.ndarray]) -> Reduction:
+    """Independent variables of a polyline: `pinned` (K,) per robot do not move, contact motions move as a whole."""
+    K, N = line.q.shape
+    rows: list[np.ndarray] = []
+    columns: list[np.ndarray] = []
+    values: list[np.ndarray] = []
+    knots: list[int] = []
+    joints: list[int] = []
+    for robot, cols in line.columns.items():
+        fixed = pinned[robot]
+        of: list[list[tuple[int, float]]] = [[(k, 1.0)] for k in range(K)]
+        for s in line.stretches:
+            if s.robot != robot:
+                continue
+            event = int(line.events[s.event])
+            for k in range(min(s.near, event), max(s.near, event) + 1):
+                of[k] = [(event, 1.0)]
+            inner, f = s.fractions(line.of(robot))
+            for k, x in zip(inner.tolist(), f.tolist(), strict=True):
+                of[k] = [(s.far, 1.0 - x), (event, x)]
+        joint = np.arange(cols.start, cols.stop)
+        first: dict[int, int] = {}
+        for k in range(K):
+            for owner, weight in of[k]:
+                if fixed[owner] or weight == 0.0:
+                    continue
+                if owner not in first:
+                    first[owner] = len(knots)
+                    knots += [owner] * len(joint)
+                    joints += joint.tolist()
+                rows.append(k * N + joint)
+                columns.append(first[owner] + np.arange(len(joint)))
+                values.append(np.full(len(joint), weight))
+    n = len(knots)
+    if rows:
+        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+        E = sparse.csr_array(entries, shape=(K * N, n))
+    else:
+        E = sparse.csr_array((K * N, n))
+    change = (E[N:] - E[:-N]).tocsr() if K > 1 else sparse.csr_array((0, n))
+    change.eliminate_zeros()
+    cones = []
+    for r, cols in enumerate(line.columns.values()):
+        for k in range(K - 1):
+            part = change[k * N + cols.start : k * N + cols.stop]
+            used = np.unique(part.indices)
+            if len(used):
+                cones.append((r * (K - 1) + k, used, part[:, used].toarray()))
+    return Reduction(line, E, np.array(knots, dtype=int), np.array(joints, dtype=int), cones)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Constraints on the variables x = (z, y): `A x >= b` softly, `C x = 0`, `F x >= g`, and a box."""
+
+    A: sparse.csr_array
+    b: np.ndarray
+    C: sparse.csr_array
+    F: sparse.csr_array
+    g: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+def solve(reduction: Reduction, q: np.ndarray, weights: CostWeights, rows: Linearised) -> np.ndarray | None:
+    """Minimise the linearised cost; returns x = (z, y), or None where Clarabel finds no optimum.
+
+    `q` (K, N) are the knots; x are changes of them and of the scaled coordinates.
+    """
+    line = reduction.line
+    steps, robots = line.knots - 1, len(line.columns)
+    n = len(rows.lower)
+    # A row that cannot become active within the trust region is none.
+    reach = rows.A.maximum(0) @ rows.lower + rows.A.minimum(0) @ rows.upper
+    active = np.flatnonzero((reach < rows.b) & (np.abs(rows.A).sum(axis=1) > 1e-9))
+    m = len(active)
+    program = MathematicalProgram()
+    x = program.NewContinuousVariables(n + robots * steps + steps + m)
+    length = n
+    span = n + robots * steps
+    slack = span + steps
+    long, short = weights.makespan, max(weights.path_length, _TINY * weights.makespan)
+    cost = np.zeros(len(x))
+    cost[length:span] = short
+    cost[span:slack] = long
+    cost[slack:] = PENALTY * (long + short)
+    program.AddLinearCost(cost, x)
+    lengths = line.lengths(q).reshape(-1)
+    low = np.concatenate([rows.lower, lengths, np.zeros(steps + m)])
+    high = np.concatenate([rows.upper, lengths, np.full(steps + m, np.inf)])
+    dq = np.diff(q, axis=0)
+    for row, used, change in reduction.cones:
+        r, k = divmod(row, steps)
+        cols = list(line.columns.values())[r]
+        size = len(change)
+        A = np.zeros((size + 1, len(used) + 1))
+        A[0, -1] = 1.0
+        A[1:, :-1] = change
+        b = np.zeros(size + 1)
+        b[1:] = dq[k, cols]
+        program.AddLorentzConeConstraint(A, b, np.append(x[used], x[length + row]))
+        low[length + row], high[length + row] = 0.0, np.inf
+    if long > 0:
+        each = np.arange(robots * steps)
+        entries = (np.concatenate([np.ones(len(each)), -np.ones(len(each))]),
+                   (np.concatenate([each, each]), np.concatenate([each, robots * steps + each % steps])))
+        order = sparse.csc_matrix(entries, shape=(len(each), robots * steps + steps))
+        program.AddLinearConstraint(order, np.full(len(each), -np.inf), np.zeros(len(each)), x[length:slack])
+    else:
+        high[span:slack] = 0.0
+    program.AddBoundingBoxConstraint(low, high, x)
+    if m:
+        A = sparse.csc_matrix(sparse.hstack([rows.A[active], sparse.eye_array(m)]))
+        program.AddLinearConstraint(A, rows.b[active], np.full(m, np.inf), np.concatenate([x[:n], x[slack:]]))
+    if rows.C.shape[0]:
+        program.AddLinearEqualityConstraint(sparse.csc_matrix(rows.C), np.zeros(rows.C.shape[0]), x[:n])
+    if rows.F.shape[0]:
+        program.AddLinearConstraint(sparse.csc_matrix(rows.F), rows.g, np.full(len(rows.g), np.inf), x[:n])
+    options = SolverOptions()
+    for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas"):
+        options.SetOption(ClarabelSolver.id(), name, _TOLERANCE)
+    result = ClarabelSolver().Solve(program, None, options)
+    return np.clip(result.GetSolution(x[:n]), rows.lower, rows.upper) if result.is_success() else None

@@ -1,0 +1,233 @@
+"""Guidance that knows costs: whole skeletons from dense sets of ways, and what experience says against them.
+
+Tasks are read off the goal (objects to be carried, subgoals to be reached); their options and candidates are the ways
+sampled so far.  The cheapest decoupled schedules are proposed; the tensor tree realises them among all robots, and
+where that fails or is dearer, the ways concerned are held to be dearer too (DESIGN section 9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrtamp.guidance import ModalGuidance
+from mrtamp.modes import Attachment, Mode
+from mrtamp.problem import HeldBy, Problem, RobotAt
+from mrtamp.skeletons import Event, Option, Skeleton, Task, lower_bound, skeletons
+from mrtamp.transitions.candidate import Candidate
+from mrtamp.transitions.sampler import TransitionSampler
+from mrtamp.transitions.ways import Stop, Way, Ways
+
+_FAILED = 2.0
+"""Added to the estimated cost of a way (rad) whose stop could not be realised."""
+_NEW = 0.03
+"""Relative gain of the estimate for which an order of events that was realised before is realised again."""
+_TRIES = 4
+"""Calls without result after which a set of ways is grown now and then only."""
+_LIMIT = 12
+_MOST = 120
+"""Ways per option that are handed to the search for skeletons."""
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A skeleton and its stops in the order in which they happen, with the ways they belong to."""
+
+    skeleton: Skeleton
+    stops: tuple[tuple[Stop, Way], ...]
+
+
+class SkeletonGuidance:
+    """Grows ways, proposes skeletons, and learns from their realisation.
+
+    Attributes
+    ----------
+    ways : the dense sets.
+    bound : the least cost of a decoupled schedule over all ways sampled so far, without what was learnt; None before
+        every task has a way.  A lower bound on plans that use these very transitions, nothing more.
+    """
+
+    def __init__(self, problem: Problem, sampler: TransitionSampler, guidance: ModalGuidance, root: Mode) -> None:
+        self.problem = problem
+        self.sampler = sampler
+        self.guidance = guidance
+        self.root = root
+        self.rng = sampler.rng
+        self.ways = Ways(sampler)
+        self.bound: float | None = None
+        self._realised: dict[tuple, float] = {}
+        self._reaching: dict[tuple[str, int], Way] = {}
+        self.items = self._in_order([o for o in root.of if not guidance.done(root, o)])
+        # A goal that ends with an object in a hand is the search's business.
+        self.applies = not any(isinstance(c, HeldBy) for c in problem.goal) and bool(self.items or problem.subgoals)
+        self.robots = [r.name for r in problem.robots if r.model.gripper is not None]
+
+    def _in_order(self, items: list[str]) -> list[str]:
+        """Objects that others will rest on come before those."""
+        below = {o: {s.body for s in self.sampler.goal_supports[o]} & set(items) - {o} for o in items}
+        out: list[str] = []
+        while len(out) < len(items):
+            ready = [o for o in items if o not in out and below[o] <= set(out)]
+            out += ready or [o for o in items if o not in out]
+        return out
+
+    # -- sampling -------------------------------------------------------------------------------------------------
+
+    def grow(self, n: int, keep: int) -> None:
+        """New ways for every task: n IK seeds per robot and object, at most `keep` new ways each."""
+        chains: dict[str, tuple[Attachment, ...]] = {}
+        serve = {s.body for o in self.items for s in self.sampler.goal_supports[o]}
+        for body in self.root.of:
+            if body in serve and body not in self.items:
+                chains[body] = self.root.chain(body)
+        for item in self.items:
+            self._grow_carries(item, chains, n, keep)
+            if not any(self.ways.of.get((item, (r,))) for r in self.robots):
+                self._grow_handovers(item, chains, n, keep)
+            if item in serve:
+                if self.ways.plan_placement(item):
+                    self._grow_carries(item, chains, n, keep)
+                chain = self.ways.settle(self.root, item, chains)
+                if chain is not None:
+                    chains[item] = chain
+        for subgoal in self.problem.subgoals:
+            self.sampler.reaching.sample(self.root, subgoal, n, keep)
+
+    def _grow_carries(self, item: str, chains: Mapping[str, tuple[Attachment, ...]], n: int, keep: int) -> None:
+        for robot in self.robots:
+            if self._worth((item, (robot,))):
+                self.ways.carry(self.root, robot, item, chains, n, keep)
+
+    def _grow_handovers(self, item: str, chains: Mapping[str, tuple[Attachment, ...]], n: int, keep: int) -> None:
+        for giver in self.robots:
+            for receiver in self.robots:
+                pair = (giver, receiver)
+                fits = all(self.sampler.families[r, item] for r in pair)
+                if giver != receiver and fits and self._worth((item, pair)):
+                    self.ways.hand_over(self.root, giver, receiver, item, chains, n, keep)
+
+    def _worth(self, key: tuple[str, tuple[str, ...]]) -> bool:
+        """Whether a set of ways should be grown: it has some, or was not tried often, or it is its turn again."""
+        fruitless = not self.ways.of.get(key) and self.ways.tries.get(key, 0) >= _TRIES
+        return not fruitless or self.rng.random() < 0.1
+
+    # -- tasks ----------------------------------------------------------------------------------------------------
+
+    def _options(self) -> dict[str, list[list[Way]]] | None:
+        """Task -> the sets of ways that are its options; None while a task has none."""
+        out: dict[str, list[list[Way]]] = {}
+        for item in self.items:
+            sets = [ways for (o, _), ways in self.ways.of.items() if o == item and ways]
+            if not sets:
+                return None
+            out[item] = [sorted(ways, key=lambda w: w.penalty)[:_MOST] for ways in sets]
+        for subgoal in self.problem.subgoals:
+            reaching = self._reach_ways(subgoal.name)
+            if not reaching:
+                return None
+            out[subgoal.name] = [reaching]
+        return out
+
+    def _reach_ways(self, name: str) -> list[Way]:
+        subgoal = self.problem.subgoal(name)
+        out = []
+        for k, at in enumerate(self.sampler.reaching.stands(name)[:_MOST]):
+            if (name, k) not in self._reaching:
+                q = {r: self.sampler.roadmaps[r].q[v].copy() for r, v in at.items()}
+                stop = Stop("reach", tuple(subgoal.targets), None, None, q, subgoal=name, at=at)
+                self._reaching[name, k] = Way((stop,))
+            out.append(self._reaching[name, k])
+        return out
+
+    def _precedence(self) -> list[tuple[tuple[str, int], tuple[str, int]]]:
+        out = []
+        for item in self.items:
+            for body in {s.body for s in self.sampler.goal_supports[item]} & set(self.items):
+                out.append(((body, -1), (item, -1)))
+            below = self.root.of[item].parent
+            if below in self.items:
+                out.append(((item, 0), (below, 0)))
+        for subgoal in self.problem.subgoals:
+            out += [((before, 0), (subgoal.name, 0)) for before in subgoal.after]
+        return out
+
+    def _ends(self) -> dict[str, np.ndarray | None]:
+        ends: dict[str, np.ndarray | None] = {r.name: None for r in self.problem.robots}
+        return ends | {c.robot: c.q for c in self.problem.goal if isinstance(c, RobotAt)}
+
+    def _option(self, ways: list[Way], penalised: bool) -> Option:
+        stops = ways[0].stops
+        events = tuple(
+            Event(s.kind, {r: np.array([w.stops[i].q[r] for w in ways]) for r in s.robots})
+            for i, s in enumerate(stops)
+        )
+        constant = sum(self.problem.cost.transitions.get(s.kind, 0.0) for s in stops)
+        penalty = np.array([w.penalty for w in ways]) if penalised else None
+        robots = tuple(dict.fromkeys(r for s in stops for r in s.robots))
+        return Option(robots, events, constant, penalty)
+
+    # -- proposals ------------------------------------------------------------------------------------------------
+
+    def propose(self, below: float = np.inf) -> Iterator[Proposal]:
+        """The cheapest skeletons that were not realised yet and whose estimate is less than `below`."""
+        sets = self._options()
+        if sets is None or not self.applies:
+            return
+        tasks = [Task(name, tuple(self._option(w, penalised=True) for w in ways)) for name, ways in sets.items()]
+        starts = {r.name: r.start for r in self.problem.robots}
+        found = skeletons(
+            tasks, self._precedence(), starts, self._ends(), self.problem.cost, limit=_LIMIT, rng=self.rng
+        )
+        for skeleton in found:
+            known = self._realised.get(skeleton.order, np.inf)
+            if skeleton.cost >= below or skeleton.cost > known * (1 - _NEW):
+                continue
+            ways = {name: sets[name][o][m] for name, (o, m) in skeleton.choices.items()}
+            stops = tuple((ways[h.task].stops[h.event], ways[h.task]) for h in skeleton.happenings)
+            yield Proposal(skeleton, stops)
+
+    def update_bound(self) -> None:
+        """Compute the least cost over all ways sampled so far."""
+        sets = self._options()
+        if sets is None or not self.applies:
+            return
+        tasks = [Task(name, tuple(self._option(w, penalised=False) for w in ways)) for name, ways in sets.items()]
+        starts = {r.name: r.start for r in self.problem.robots}
+        self.bound = lower_bound(tasks, self._precedence(), starts, self._ends(), self.problem.cost).value
+
+    def failed(self, way: Way) -> None:
+        """A stop of this way could not be reached, or its transition could not happen."""
+        way.failures += 1
+        way.penalty += _FAILED
+
+    def realised(self, proposal: Proposal) -> None:
+        """A proposal became a plan; others get their turn, and this order again only when its estimate improves."""
+        self._realised[proposal.skeleton.order] = proposal.skeleton.cost
+
+    # -- realisation ----------------------------------------------------------------------------------------------
+
+    def candidate(self, stop: Stop, mode: Mode) -> Candidate | None:
+        """A stop on the roadmaps, for use in `mode`; None where it collides with how things are there."""
+        if stop.kind == "reach":
+            assert stop.subgoal is not None and stop.at is not None
+            return self.sampler.reaching.candidate(mode, self.problem.subgoal(stop.subgoal), stop.at)
+        if stop.candidate is None:
+            stop.candidate = self._register(stop, mode)
+        return stop.candidate
+
+    def _register(self, stop: Stop, mode: Mode) -> Candidate | None:
+        sampler = self.sampler
+        assert stop.before is not None and stop.after is not None
+        picks = stop.kind == "pick"
+        [robot] = stop.robots
+        placement, grasp = (stop.before, stop.after) if picks else (stop.after, stop.before)
+        base = mode.chain(placement.parent) if placement.parent in mode.of else ()
+        stats = sampler.outcome((stop.kind, stop.robots, placement.object, placement.place))
+        v = sampler.contacts.contact(robot, placement, (placement, *base), grasp, stop.q[robot], stats, mode)
+        if v is None:
+            return None
+        stats.accepted += 1
+        pick, place = sampler.register(robot, v, placement, grasp, base)
+        return pick if picks else place

@@ -1,0 +1,44 @@
+"""The planner on problems with known optima, in short, and the plot of its convergence."""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+import pytest
+
+from mrtamp.convergence import KNOWN, Curve, Panel, drawing, mean_curve, optimum
+from mrtamp.planner import Planner
+from mrtamp.problem_file import load_problem
+
+
+@pytest.mark.parametrize("row", KNOWN, ids=lambda row: row.problem)
+def test_planner_approaches_the_optimum_from_above(row):
+    planner = Planner(load_problem(row.problem), seed=0)
+    for _ in planner.improve(3.0):
+        pass
+    assert planner.best is not None
+    best = optimum(row.problem)
+    assert best * (1 - 1e-9) <= planner.best.cost <= best * (1 + 3 * row.within)
+
+
+def panel() -> Panel:
+    curves = (Curve(0, (0.1, 1.0), (15.0, 11.0)), Curve(1, (0.5, 2.0), (13.0, 10.0)), Curve(2, (), ()))
+    return Panel("example", 10.0, 10.0, curves)
+
+
+def test_mean_begins_when_every_run_has_a_plan():
+    assert mean_curve(panel()) == [(0.5, 1.4), (1.0, 1.2), (2.0, 1.05)]
+    assert mean_curve(Panel("none", 10.0, 10.0, (Curve(0, (), ()),))) == []
+
+
+def test_cost_of_a_run_between_its_incumbents():
+    curve = panel().curves[0]
+    assert [curve.cost_at(t) for t in (0.05, 0.1, 0.9, 1.0, 5.0)] == [float("inf"), 15.0, 15.0, 11.0, 11.0]
+
+
+def test_plot_draws_every_run_the_mean_and_the_optimum():
+    root = ElementTree.fromstring(drawing([panel(), panel()]))
+    kinds = [e.get("class") for e in root.iter("{http://www.w3.org/2000/svg}path")]
+    assert (kinds.count("r"), kinds.count("m"), kinds.count("o")) == (4, 2, 2)
+    titles = [e.text for e in root.iter("{http://www.w3.org/2000/svg}text") if e.get("class") == "t"]
+    assert titles == ["example: optimum 10.000"] * 2

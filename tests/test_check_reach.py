@@ -1,0 +1,214 @@
+"""The judge on subgoals: a hand-made plan is accepted, and each way of getting it wrong is found."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from discs import HEIGHT, Errands, disc_problem, errand
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from mrtamp.check import check_plan
+from mrtamp.modes import Attachment
+from mrtamp.plan import Plan, Segment, Transition
+from mrtamp.problem import AtConfiguration, Attach, CollisionRules, Problem, Shape, StaticBody, Subgoal
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
+    return disc_problem(tmp_path_factory.mktemp("discs"))
+
+
+def verdict(plan: Plan) -> set[str]:
+    return check_plan(plan).kinds
+
+
+def test_a_plan_that_reaches_every_subgoal_is_accepted(problem: Problem) -> None:
+    report = check_plan(errand(problem))
+    assert report.ok, str(report)
+    # The closest approach: b stands 5 cm from the token when it takes it.
+    assert report.min_clearance_m == pytest.approx(0.05, abs=1e-3)
+
+
+def test_things_may_follow_each_other_in_no_time(problem: Problem) -> None:
+    """Two transitions at one configuration, with a segment of a single waypoint between them."""
+    e = Errands(problem).move(a=(-0.5, -0.9)).move(b=(0.9, -0.5)).reach("visit").reach("take")
+    e.move(b=(0.9, 0.5)).move(a=(-0.5, -0.5), b=(0.5, 0.5)).reach("drop")
+    plan = e.plan()
+    assert plan.segments[1].length == 1
+    report = check_plan(plan)
+    assert report.ok, str(report)
+
+
+def forget(problem: Problem) -> Plan:
+    return (
+        Errands(problem).move(b=(0.9, -0.5)).reach("take").move(b=(0.9, 0.5)).move(b=(0.55, 0.5)).reach("drop").plan()
+    )
+
+
+def twice(problem: Problem) -> Plan:
+    e = Errands(problem).move(a=(-0.5, -0.9), b=(0.9, -0.5)).reach("visit", "take").reach("visit")
+    return e.move(b=(0.9, 0.5)).move(a=(-0.5, -0.5), b=(0.55, 0.5)).reach("drop").plan()
+
+
+def too_early(problem: Problem) -> Plan:
+    return Errands(problem).move(b=(0.9, 0.5)).move(b=(0.55, 0.5)).reach("drop").plan()
+
+
+def beside(problem: Problem) -> Plan:
+    return Errands(problem).move(a=(-0.5, -0.8999)).move(a=(-0.5, -0.8997)).reach("visit").plan()
+
+
+def beside_the_pose(problem: Problem) -> Plan:
+    return Errands(problem).move(b=(0.8997, -0.5)).reach("take").plan()
+
+
+def beside_the_box(problem: Problem) -> Plan:
+    return (
+        Errands(problem).move(b=(0.9, -0.5)).reach("take").move(b=(0.9, 0.5)).move(b=(0.601, 0.5)).reach("drop").plan()
+    )
+
+
+@pytest.mark.parametrize(
+    ("plan", "kind", "text"),
+    [
+        (forget, "goal", "visit is never reached"),
+        (twice, "transition", "reach of visit: it has been reached before"),
+        (too_early, "transition", "reach of drop: take should have been reached before"),
+        (beside, "transition", "reach of visit: a is 0.0003 from its configuration"),
+        (beside_the_pose, "transition", "reach of take: b is 0.30 mm and 0.00 degrees from its pose"),
+        (beside_the_box, "transition", "reach of drop: b is 1.00 mm outside its box"),
+    ],
+)
+def test_what_is_not_reached_is_found(problem: Problem, plan: Callable[[Problem], Plan], kind: str, text: str) -> None:
+    report = check_plan(plan(problem))
+    assert any(v.kind == kind and text in v.message for v in report.violations), str(report)
+
+
+def edit(plan: Plan, k: int, n: int = 0, **changes) -> Plan:
+    """The plan with another action n at transition k, and modes that follow from it."""
+    actions = list(plan.transitions[k].actions)
+    actions[n] = dataclasses.replace(actions[n], **changes)
+    transitions = [Transition(tuple(actions)) if i == k else t for i, t in enumerate(plan.transitions)]
+    segments = [plan.segments[0]]
+    for segment, transition in zip(plan.segments[1:], transitions, strict=True):
+        segments.append(Segment(segments[-1].mode.after(transition), segment.q))
+    return dataclasses.replace(plan, segments=segments, transitions=transitions)
+
+
+def moved(a: Attachment | None, **changes) -> Attachment:
+    assert a is not None
+    return dataclasses.replace(a, **changes)
+
+
+def test_an_unknown_subgoal_and_the_wrong_robots_are_found(problem: Problem) -> None:
+    plan = errand(problem)
+    assert "unknown subgoal 'visits', expected one of visit, take, drop" in str(
+        check_plan(edit(plan, 0, subgoal="visits"))
+    )
+    assert "the robots are a, b, expected a" in str(check_plan(edit(plan, 0, robots=("a", "b"))))
+    assert "only a reach reaches a subgoal" in str(check_plan(edit(plan, 0, kind="pick")))
+    assert "token is not attached to world" in str(check_plan(edit(plan, 1, before=None, after=None)))
+
+
+def test_the_object_is_attached_as_the_subgoal_says_and_where_it_is(problem: Problem) -> None:
+    plan = errand(problem)
+    take, drop = plan.transitions[0].actions[1], plan.transitions[1].actions[0]
+    elsewhere = moved(take.after, X_PO=RigidTransform([0, -0.31, 0]).GetAsMatrix4())
+    assert "token jumps by 10.00 mm" in str(check_plan(edit(plan, 0, 1, after=elsewhere)))
+    turned = moved(take.after, X_PO=RigidTransform(RollPitchYaw(0, 0, 0.1), [0, -0.3, 0]).GetAsMatrix4())
+    assert "continuity" in verdict(edit(plan, 0, 1, after=turned))
+    assert "token is held by a, which has no gripper" in str(
+        check_plan(edit(plan, 0, 1, after=moved(take.after, parent="a")))
+    )
+    assert "rests on 'somewhere'" in str(check_plan(edit(plan, 1, after=moved(drop.after, support="somewhere"))))
+    assert "rests on 'at drop'" in str(check_plan(edit(plan, 1, after=moved(drop.after, parent="wall"))))
+
+
+def test_modes_say_what_has_been_reached(problem: Problem) -> None:
+    plan = errand(problem)
+    segments = [dataclasses.replace(s, mode=dataclasses.replace(s.mode, done=frozenset())) for s in plan.segments]
+    report = check_plan(dataclasses.replace(plan, segments=segments))
+    assert "transition" in report.kinds and "goal" in report.kinds
+    everything = frozenset(s.name for s in problem.subgoals)
+    segments = [dataclasses.replace(s, mode=dataclasses.replace(s.mode, done=everything)) for s in plan.segments]
+    report = check_plan(dataclasses.replace(plan, segments=segments))
+    assert "start" in report.kinds and "transition" in report.kinds
+
+
+def test_two_robots_reach_together_or_not_at_all(problem: Problem) -> None:
+    both = Subgoal("meet", {n: AtConfiguration(np.array([x, 0.5])) for n, x in (("a", 0.3), ("b", 0.75))})
+    apart = dataclasses.replace(problem, subgoals=(both,), goal=())
+    e = Errands(apart).move(a=(-1.1, -0.5), b=(1, -0.5)).move(a=(-1.1, 0.5), b=(1, 0.5))
+    assert check_plan(e.move(a=(0.3, 0.5), b=(0.75, 0.5)).reach("meet").plan()).ok
+    e = Errands(apart).move(a=(-1.1, -0.5), b=(1, -0.5)).move(a=(-1.1, 0.5), b=(1, 0.5))
+    assert "b is 0.05 from its configuration" in str(
+        check_plan(e.move(a=(0.3, 0.5), b=(0.8, 0.5)).reach("meet").plan())
+    )
+
+
+def test_what_was_let_go_stays_and_may_not_be_run_over(problem: Problem) -> None:
+    plan = errand(problem)
+    through = {**plan.segments[-1].q, "b": np.array([[0.55, 0.5], [0.55, 0.3]])}
+    segments = [*plan.segments[:-1], Segment(plan.segments[-1].mode, through)]
+    assert "collision" in verdict(dataclasses.replace(plan, segments=segments))
+
+
+def test_a_held_object_may_touch_the_body_that_carries_the_grasp_frame(problem: Problem) -> None:
+    """The token starts 5 mm inside the place of the disc that takes it: arriving collides, carrying does not."""
+    token = dataclasses.replace(problem.objects[0], start_X_BO=RigidTransform([0.9, -0.745, 0.06]))
+    close = dataclasses.replace(problem, objects=(token,))
+    report = check_plan(errand(close))
+    assert {v.segment for v in report.violations} == {0, 2}, "on arrival, and once it is let go"
+    through = dataclasses.replace(close, collision=CollisionRules((("b/disc", "token"),)))
+    assert check_plan(errand(through)).ok
+
+
+def test_a_taken_object_leaves_what_it_stands_on_like_a_picked_one(problem: Problem) -> None:
+    """The disc drags the token in +y off a ledge: over its edge is a lift, along its top is not."""
+
+    def on_ledge(overlap: float) -> Problem:
+        ledge = StaticBody("ledge", RigidTransform([0.9, -0.9 + overlap, 0.0]), Shape("box", (0.1, 0.1, 0.02)))
+        X_BO = RigidTransform([0, 0.1 - overlap, HEIGHT])
+        token = dataclasses.replace(problem.objects[0], start_on="ledge", start_X_BO=X_BO)
+        return dataclasses.replace(problem, statics=(*problem.statics, ledge), objects=(token,))
+
+    report = check_plan(errand(on_ledge(0.007)))
+    assert report.ok, str(report)
+    report = check_plan(errand(on_ledge(0.05)))
+    assert "contact" in report.kinds
+    assert "token has moved 10.0 mm along ledge in contact after it is picked from it" in str(report)
+    free = dataclasses.replace(on_ledge(0.05), collision=CollisionRules((("token", "ledge"),)))
+    assert check_plan(errand(free)).ok, "pairs that are ignored are never in contact"
+
+
+def test_a_tolerance_is_for_the_sum_of_penetrations(problem: Problem) -> None:
+    """Discs that overlap by 4 mm at their meeting, and one of them the wall by 3 mm."""
+    meeting = {"a": np.array([0.15, 0.247]), "b": np.array([0.15 + 0.396, 0.247])}
+    both = Subgoal("meet", {n: AtConfiguration(q) for n, q in meeting.items()})
+
+    def with_tolerance(tolerance: float) -> Problem:
+        return dataclasses.replace(
+            problem, subgoals=(both,), goal=(), objects=(), collision=CollisionRules((), tolerance)
+        )
+
+    def meet(tolerance: float) -> Plan:
+        e = Errands(with_tolerance(tolerance)).move(a=(-1.1, -0.5), b=(1, -0.5)).move(a=(-1.1, 0.5), b=(1, 0.5))
+        e.move(a=(0.1, 0.5), b=(1, 0.5)).move(**meeting).reach("meet")
+        return e.plan()
+
+    apart = {v.sides[0].owner + v.sides[1].owner for v in check_plan(meet(0.0)).violations if v.sides}
+    assert len(apart) == 2
+    assert not check_plan(meet(0.005)).ok, "each alone would be tolerated"
+    assert check_plan(meet(0.0071)).ok, str(check_plan(meet(0.0071)))
+
+
+def test_a_subgoal_can_hand_an_object_from_robot_to_robot(problem: Problem) -> None:
+    give = Subgoal("give", {"a": AtConfiguration(np.array([0.9, -1.05]))}, ("take",), Attach("token", "a"))
+    both = dataclasses.replace(problem, subgoals=(problem.subgoal("take"), give), goal=())
+    e = Errands(both).move(b=(0.9, -0.5)).move(a=(-0.5, -1.2)).move(a=(0.8, -1.2)).reach("take")
+    e.move(b=(0.9, -0.45)).move(a=(0.9, -1.05)).reach("give").move(a=(0.9, -1.2))
+    report = check_plan(e.plan())
+    assert report.ok, str(report)
