@@ -178,6 +178,14 @@ class Script:
         self.mode = self.mode.replace(*news)
         return self
 
+    def reach(self, subgoal: str, new: Attachment) -> Script:
+        """A transition that reaches a subgoal and gives an object its new attachment."""
+        self._end()
+        action = Action("reach", tuple(self.problem.subgoal(subgoal).targets), self.mode.of[new.object], new, subgoal)
+        self.transitions.append(Transition((action,)))
+        self.mode = self.mode.after(self.transitions[-1])
+        return self
+
     def plan(self) -> Plan:
         """The finished plan."""
         self._end()

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from discs import HEIGHT, Errands, disc_problem, errand
+from gantry import Script, gantry_problem, grasp
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from mrtamp.check import check_plan
+from mrtamp.check import Report, check_plan
 from mrtamp.modes import Attachment
 from mrtamp.plan import Plan, Segment, Transition
-from mrtamp.problem import AtConfiguration, Attach, CollisionRules, Problem, Shape, StaticBody, Subgoal
+from mrtamp.problem import WORLD, AtConfiguration, Attach, CollisionRules, Problem, Shape, StaticBody, Subgoal
 
 
 @pytest.fixture(scope="module")
@@ -212,3 +214,60 @@ def test_a_subgoal_can_hand_an_object_from_robot_to_robot(problem: Problem) -> N
     e.move(b=(0.9, -0.45)).move(a=(0.9, -1.05)).reach("give").move(a=(0.9, -1.2))
     report = check_plan(e.plan())
     assert report.ok, str(report)
+
+
+def test_a_robot_with_fingers_keeps_them_as_they_are(tmp_path: Path) -> None:
+    """The gantry takes the cube between its open fingers, though that is none of the cube's grasps; then lets go."""
+    gantries = gantry_problem(tmp_path)
+    take = Subgoal("take", {"left": AtConfiguration(np.array([-0.4, 0, 0.04, 0]))}, (), Attach("cube", "left"))
+    drop = Subgoal("drop", {"left": AtConfiguration(np.array([-0.4, 0.1, 0.3, 0]))}, ("take",), Attach("cube", WORLD))
+    problem = dataclasses.replace(gantries, subgoals=(take, drop), goal=())
+
+    def carry() -> Plan:
+        s = Script(problem).move(left=(-0.4, 0, 0.2)).move(left=(-0.4, 0, 0.04))
+        X_GO = RigidTransform(RollPitchYaw(np.pi, 0, 0), [0, 0, 0.01]).inverse()
+        s.reach("take", Attachment("cube", "left", X_GO.GetAsMatrix4()))
+        s.move(left=(-0.4, 0, 0.3)).move(left=(-0.4, 0.1, 0.3))
+        s.reach("drop", Attachment("cube", WORLD, RigidTransform([-0.4, 0.1, 0.29]).GetAsMatrix4(), "at drop"))
+        return s.move(left=(-0.4, 0.1, 0.4)).plan()
+
+    report = check_plan(carry())
+    assert report.ok, str(report)
+    plan = carry()
+    picked = edit(plan, 0, kind="pick", subgoal=None)
+    assert "only a reach fixes an object like that" in str(check_plan(picked))
+    squeezed = edit(plan, 0, after=moved(plan.transitions[0].actions[0].after, width=0.04))
+    assert "expected cube to left" in str(check_plan(squeezed))
+
+
+def test_what_rests_can_be_fixed_to_something_else_where_it_is(tmp_path: Path) -> None:
+    """The cube stands on the table, beside the block: from now on it belongs to the block and goes where that goes."""
+    gantries = gantry_problem(tmp_path)
+    cube = dataclasses.replace(gantries.objects[0], start_X_BO=RigidTransform([-0.4, 0.2595, 0.05]))
+    tie = Subgoal("tie", {"right": AtConfiguration(np.array([0.5, 0.1, 0.3, 0]))}, (), Attach("cube", "block"))
+    problem = dataclasses.replace(gantries, objects=(cube, *gantries.objects[1:]), subgoals=(tie,), goal=())
+    X_BO = RigidTransform([0, -0.0405, 0]).GetAsMatrix4()
+
+    def tied() -> Script:
+        return Script(problem).move(right=(0.5, 0.1, 0.3)).reach("tie", Attachment("cube", "block", X_BO, "at tie"))
+
+    report = check_plan(tied().move(right=(0.5, 0.2, 0.3)).plan())
+    assert report.ok, str(report)
+    s = tied().move(left=(-0.4, 0.3, 0.3)).move(left=(-0.4, 0.3, 0.04)).change("pick", grasp("block", "left"))
+    assert "cube rests on it" in str(check_plan(s.move(left=(-0.4, 0.3, 0.3)).plan()))
+
+
+def test_objects_at_rest_count_towards_the_tolerance(tmp_path: Path) -> None:
+    """Cube and block overlap by 2 mm where they stand."""
+    gantries = gantry_problem(tmp_path)
+    cube = dataclasses.replace(gantries.objects[0], start_X_BO=RigidTransform([-0.4, 0.262, 0.05]))
+
+    def report(tolerance: float) -> Report:
+        rules = CollisionRules((), tolerance)
+        objects = (cube, *gantries.objects[1:])
+        problem = dataclasses.replace(gantries, objects=objects, goal=(), collision=rules)
+        return check_plan(Script(problem).move(left=(-0.5, 0, 0.4)).plan())
+
+    assert "cube and block collide at rest, 2.00 mm deep" in str(report(0.0))
+    assert not report(0.0019).ok
+    assert report(0.0021).ok

@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform
 
 from mrtamp.collision import CONTACT_DEPTH, PADDING, Collision, Counts, bisection_order
 from mrtamp.modes import Attachment, start_mode
-from mrtamp.problem import CollisionRules, Gripper, Problem
+from mrtamp.problem import CollisionRules, Gripper, MrtampError, Problem
 from mrtamp.scene import build_scene, geometry_ids
 
 
@@ -109,6 +109,12 @@ def test_pairs_that_are_ignored_may_overlap(problem: Problem, pair: tuple[str, s
     world = Collision(ruled(problem, pair)).worlds["left"]
     q = np.array([[-0.4, 0.03, 0.04, 0], [0, 0.6, 0.1, 0]])
     np.testing.assert_array_equal(~world.hits(world.rows(q, None, resting(problem))), free)
+
+
+@pytest.mark.parametrize(("thing", "says"), [("lift", "left, right, table"), ("left/palm", "bodies of left: .*tool")])
+def test_rules_about_unknown_things_are_errors(problem: Problem, thing: str, says: str) -> None:
+    with pytest.raises(MrtampError, match=f"found '{thing}', .*{says}"):
+        Collision(ruled(problem, ("table", thing)))
 
 
 def test_objects_of_one_shape_share_a_slot_only_under_the_same_rules(problem: Problem) -> None:

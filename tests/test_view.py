@@ -140,8 +140,7 @@ def test_pages_and_windows_survive_threads() -> None:
     code = """if True:
         import gc, threading
         import mrtamp
-        from mrtamp.stage import GHOSTS
-from mrtamp.view import inline, view
+        from mrtamp.view import inline, view
         problem = mrtamp.load_problem("box")
         def work():
             inline(problem)

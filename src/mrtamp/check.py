@@ -13,7 +13,8 @@ from itertools import pairwise
 import numpy as np
 
 from mrtamp.check_attachments import AttachmentJudge, carrier, has_cycle
-from mrtamp.check_motion import Contact, Motion, MotionJudge, Timeline, held_pairs
+from mrtamp.check_contact import Contact, contact_phase, held_pairs
+from mrtamp.check_motion import Motion, MotionJudge, Timeline
 from mrtamp.check_reach import not_there, same_pose
 from mrtamp.check_report import FirstViolation, Report, Side, Violation
 from mrtamp.check_scene import JudgeScene
@@ -254,7 +255,7 @@ class Checker:
         judge = MotionJudge(self.world, resolution)
         motions = self._motions(plan)
         lines = [Timeline(self.world, motion) for motion in motions]
-        landings = self._landings(plan, lines, judge, report)
+        landings = self._landings(plan, lines, resolution, report)
         lifting: dict[str, Contact] = {}
         for k, line in enumerate(lines):
             changed = list(plan.segments[0].mode.of)
@@ -270,7 +271,7 @@ class Checker:
             judge.resting(motions[k], changed, report, {(c.object, c.other) for c in lifting.values()})
             windows = dict(landings[k])
             for name, contact in list(lifting.items()):
-                end = judge.walk(line, contact, report, backward=False)
+                end = contact_phase(line, contact, resolution, report, backward=False)
                 low, high = windows.get((name, contact.other), (0.0, line.length))
                 windows[name, contact.other] = (np.inf if end is None else max(low, end), high)
                 if end is not None:
@@ -278,7 +279,7 @@ class Checker:
             judge.judge(line, report, windows)
 
     def _landings(
-        self, plan: Plan, lines: list[Timeline], judge: MotionJudge, report: Report
+        self, plan: Plan, lines: list[Timeline], resolution: float, report: Report
     ) -> list[dict[tuple[str, str], tuple[float, float]]]:
         """Per segment, (object, support) -> the stretch of s in which an object yet to be placed must not touch."""
         out: list[dict[tuple[str, str], tuple[float, float]]] = [{} for _ in lines]
@@ -289,7 +290,7 @@ class Checker:
                     landing[action.after.object] = self._contact(action.after)
             landing = {name: c for name, c in landing.items() if name in lines[k].motion.carried}
             for name, contact in list(landing.items()):
-                begin = judge.walk(lines[k], contact, report, backward=True)
+                begin = contact_phase(lines[k], contact, resolution, report, backward=True)
                 out[k][name, contact.other] = (0.0, -np.inf if begin is None else begin)
                 if begin is not None:
                     del landing[name]

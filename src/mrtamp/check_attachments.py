@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from mrtamp.check_motion import TOUCH
+from mrtamp.check_contact import TOUCH
 from mrtamp.check_reach import attaches, reach_rules, same_pose
 from mrtamp.check_report import Report, Violation
 from mrtamp.check_scene import JudgeScene

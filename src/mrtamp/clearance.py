@@ -25,13 +25,15 @@ _CURVE = 1.1
 class Track:
     """Motion of one robot with what it holds over M knots, its bounding spheres at the knots and their travel.
 
-    `held` is what the robot holds in each of the M - 1 steps.
+    `held` is what the robot holds in each of the M - 1 steps, `finer` how many times as densely each is sampled where the
+    world is close.
     """
 
     def __init__(self, roadmap: Roadmap, q: np.ndarray, held: Sequence[Attachment | None]) -> None:
         self.roadmap = roadmap
         self.q = q
         self.held = held
+        self.finer = np.ones(len(q) - 1, dtype=int)
         world = roadmap.world
         self.centres = world.bounds.spheres(q)
         self.radii = world.bounds.radii
@@ -128,7 +130,7 @@ class Clearance:
                 groups.setdefault((a.held[s], objects), []).append(s)
         for (held, objects), members in groups.items():
             group = np.array(members)
-            k, t = samples(group, self.pieces(a.travel[group]))
+            k, t = samples(group, self.pieces(a.travel[group] * a.finer[group]))
             order = self.rng.permutation(len(k))
             k, t = k[order], t[order]
             poses: Mapping[str, np.ndarray] = {x.name: x.X_WO for x in objects}

@@ -18,6 +18,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from mrtamp.mechanisms import INTRA_ORBIT_NAMES, MECHANISMS
+
 if TYPE_CHECKING:
     from mrtamp.plan import Plan
     from mrtamp.planner import Planner
@@ -95,9 +97,10 @@ def _plan(options: argparse.Namespace) -> int:
     with _stop_on_signals() as signals, ProgressLine(sys.stderr, enabled=not options.quiet) as progress:
         try:
             problem = _load_problem(options)
-            from mrtamp.planner import Planner
+            from mrtamp.planner import Options, Planner
 
-            planner = Planner(problem, seed=options.seed)
+            settings = Options(without=frozenset(options.without), intra_orbit=options.intra_orbit)
+            planner = Planner(problem, seed=options.seed, options=settings)
             budget = options.budget
             if budget is None and options.iterations is None:
                 budget = DEFAULT_BUDGET_S
@@ -118,7 +121,8 @@ def _plan(options: argparse.Namespace) -> int:
 
         write_html(best, options.html)
         written.append(options.html)
-    _report_plan(options, best, elapsed, written, stopped=bool(signals))
+    assert planner is not None
+    _report_plan(options, best, elapsed, written, planner.skeletons.bound, stopped=bool(signals))
     if options.view:
         _serve(best, options)
     return FOUND
@@ -146,13 +150,19 @@ def _bounds(options: argparse.Namespace) -> str:
 
 
 def _report_plan(
-    options: argparse.Namespace, plan: Plan, elapsed: float, written: list[Path], *, stopped: bool
+    options: argparse.Namespace,
+    plan: Plan,
+    elapsed: float,
+    written: list[Path],
+    bound: float | None,
+    *,
+    stopped: bool,
 ) -> None:
     from mrtamp import report
 
     if options.json:
         files = {"out": options.out, "html": options.html}
-        data = {"ok": True, "stopped": stopped, "elapsed_s": elapsed, **report.summary(plan)}
+        data = {"ok": True, "stopped": stopped, "elapsed_s": elapsed, **report.summary(plan), "sampled_bound": bound}
         data["files"] = {key: str(path) for key, path in files.items() if path}
         print(json.dumps(data))
         return
@@ -163,12 +173,23 @@ def _report_plan(
         f"{plan.problem.name}: {manner} (seed {plan.seed}, {elapsed:.1f} s)",
         report.timeline_text(plan),
         report.cost_text(plan),
+        _bound_text(plan.cost, bound),
         report.history_text(plan),
         report.counts_text(plan),
     ]
     if written:
         blocks.append("\n".join(f"wrote {path} ({_size(path)})" for path in written))
     print("\n\n".join(block for block in blocks if block))
+
+
+def _bound_text(cost: float, bound: float | None) -> str:
+    """How far the plan is from the cheapest decoupled skeleton; that bounds what these transitions allow, no more."""
+    if bound is None:
+        return ""
+    return (
+        f"sampled bound: {bound:.3f} ({cost / bound - 1:+.1%}): the cheapest assignment and order over the transitions "
+        "sampled so far, robots not in each other's way"
+    )
 
 
 def _size(path: Path) -> str:
@@ -370,6 +391,20 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--out", type=Path, metavar="FILE", help="write the plan (JSON)")
     plan.add_argument("--html", type=Path, metavar="FILE", help="write a page with the animation, good without network")
     plan.add_argument("--view", action="store_true", help="open a live window on the plan afterwards")
+    plan.add_argument(
+        "--without",
+        action="append",
+        default=[],
+        metavar="MECHANISM",
+        choices=sorted(MECHANISMS),
+        help=f"switch a mechanism off (repeatable): {', '.join(MECHANISMS)}",
+    )
+    plan.add_argument(
+        "--intra-orbit",
+        default="tensor-tree",
+        choices=INTRA_ORBIT_NAMES,
+        help="planner of motion inside an orbit (default tensor-tree)",
+    )
     how = plan.add_mutually_exclusive_group()
     how.add_argument("--quiet", action="store_true", help="print nothing but errors")
     how.add_argument("--json", action="store_true", help="print one JSON object on stdout")

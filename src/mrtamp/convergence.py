@@ -26,6 +26,8 @@ class KnownOptimum:
     within: float
 
 
+ROUNDING = 1e-6
+"""How far, relative to the optimum, a cost may be below it: robots reach their targets up to a tolerance."""
 KNOWN = (
     KnownOptimum("square_sequence", 5.0, 0.002),
     KnownOptimum("square_free", 5.0, 0.002),
@@ -98,7 +100,7 @@ def convergence(
         mean = sum(ends) / len(ends)
         found = sum(bool(curve.costs) for curve in curves)
         # A plan that costs less than the optimum would mean that one of the two is wrong.
-        good &= found == seeds and mean <= 1 + row.within and min(ends) >= 1 - 1e-9
+        good &= found == seeds and mean <= 1 + row.within and min(ends) >= 1 - ROUNDING
         say(
             f"| {row.problem} | {best:.4f} | {found}/{seeds} | {sum(firsts) / len(firsts):.3f} | {mean:.4f} "
             f"| {max(ends):.4f} | {min(ends):.4f} | {row.budget_s:g} s | {1 + row.within:g} |"

@@ -36,7 +36,7 @@ def explain(planner: Planner) -> str:
         lines.append(
             f"The check refused {planner.incumbent.refused} plans, the last for {planner.incumbent.last_refusal}"
         )
-    trouble = [(count, robot, other) for (robot, other), count in planner.growth.steering.trouble.items()]
+    trouble = [(count, robot, other) for (robot, other), count in planner.growth.motion.trouble.items()]
     if trouble:
         lines.append("Motions that failed, and what was in the way:")
         for count, robot, other in sorted(trouble, reverse=True)[:_MANY]:

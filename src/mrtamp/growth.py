@@ -14,11 +14,12 @@ import numpy as np
 from mrtamp.check import Report
 from mrtamp.check_report import Violation
 from mrtamp.graphs import Graphs
+from mrtamp.intra_orbit.orbits import Orbits
+from mrtamp.intra_orbit.planners import INTRA_ORBIT
 from mrtamp.modes import Mode, goal_mode
 from mrtamp.plan import Transition, without_detours
 from mrtamp.problem import MrtampError, Problem, RobotAt
 from mrtamp.roadmap import Roadmap
-from mrtamp.steering import Steering
 from mrtamp.tensor_tree import At, Node, TensorTree
 from mrtamp.transitions.candidate import Candidate
 from mrtamp.validity import Validity
@@ -45,6 +46,7 @@ class Growth:
         roadmaps: Mapping[str, Roadmap],
         validity: Validity,
         rng: np.random.Generator,
+        intra_orbit: str = "tensor-tree",
     ) -> None:
         self.problem = problem
         self.roadmaps = roadmaps
@@ -54,7 +56,9 @@ class Growth:
         self.counts = validity.counts
         self.graphs = Graphs()
         self.tree = TensorTree(list(roadmaps.values()), problem.cost)
-        self.steering = Steering(list(roadmaps.values()), validity, self._insert, rng)
+        graphs = list(roadmaps.values())
+        self.orbits = Orbits(self.tree, self.graphs, graphs, validity)
+        self.motion = INTRA_ORBIT[intra_orbit](graphs, validity, self._insert, rng, problem.cost)
         self.goal_vertices: dict[str, int] = {}
         self.goal_nodes: list[Node] = []
         self._banned: set[tuple] = set()
@@ -79,7 +83,7 @@ class Growth:
 
     def towards(self, near: Node, combination: Combination) -> Node | None:
         """Drive the active robots to their transition vertices and change the mode there; the node after it."""
-        node = self.steering.drive(near, {r: v for c in combination for r, v in c.at.items()})
+        node = self.motion.drive(near, {r: v for c in combination for r, v in c.at.items()})
         return None if node is None else self._change_mode(node, combination)
 
     def _change_mode(self, node: Node, combination: Combination) -> Node | None:
@@ -91,12 +95,9 @@ class Growth:
             return None
         cost = sum(self.problem.cost.transitions.get(c.kind, 0.0) for c in combination)
         known = self.tree.find(mode, node.at)
-        if known is not None and known.cost <= node.cost + cost:
-            return known
-        orbit = self.graphs.add_orbit(mode) if known is None else None
-        after = self.tree.insert_transition(node, transition, mode, orbit, cost)
-        self.graphs.transition(node.orbit, after.orbit)
-        self.note_goal(after)
+        after = self.orbits.enter(node, transition, mode, cost)
+        if known is None:
+            self.note_goal(after)
         return after
 
     def taken(self, mode: Mode, candidate: Candidate) -> bool:
@@ -151,10 +152,10 @@ class Growth:
     def towards_goal(self, near: Node) -> Node | None:
         """In a mode that satisfies the goal, bring the robots to where they have to end; the node there, or None."""
         for name in [str(x) for x in self.rng.permutation(list(self.goal_vertices))]:
-            near = self.steering.drive(near, {name: self.goal_vertices[name]}) or near
+            near = self.motion.drive(near, {name: self.goal_vertices[name]}) or near
         # Whoever was sent aside comes back at the end.
         for name, v in self.goal_vertices.items():
-            near = self.steering.drive(near, {name: v}, depth=0) or near
+            near = self.motion.drive(near, {name: v}, depth=0) or near
         return near if self._is_goal(near) else None
 
     def _is_goal(self, node: Node) -> bool:
@@ -168,10 +169,7 @@ class Growth:
 
     def _insert(self, node: Node, at: At) -> Node:
         """InsertAndRewire: a validated step; orbits that it proves connected become one."""
-        new, is_new = self.tree.insert(node, at)
-        if not is_new and new.orbit != node.orbit:
-            kept = self.graphs.merge(new.orbit, node.orbit)
-            self.tree.merge_orbits(kept, new.orbit if new.orbit != kept else node.orbit)
+        new, is_new = self.orbits.insert(node, at)
         self.counts.nodes = len(self.tree.nodes)
         if is_new:
             self.note_goal(new)
@@ -180,7 +178,7 @@ class Growth:
     # -- repair ---------------------------------------------------------------------------------------------------
 
     def repair(self, report: Report, groups: list[list[Node]]) -> None:
-        """The judge found what samples had missed: forbid that step, or that change of mode, and cut the tree there."""
+        """The judge found what samples had missed: that step, or that change of mode, is withdrawn."""
         for violation in report.violations:
             if violation.kind not in ("collision", "contact") or violation.segment is None:
                 raise MrtampError(f"the planner produced an illegal plan; please report this: {violation}")
@@ -191,15 +189,10 @@ class Growth:
                 # Fingers that close or open at the transition may be the cause.
                 after = groups[violation.segment + 1][0]
                 self._banned.add((after.mode.key, after.at))
-                if after.alive:
-                    self.tree.cut(after)
+                self.orbits.refute_entries(after)
             if step + 1 < len(group):
                 before, after = group[step], group[step + 1]
-                guilty, obstacle = self._guilty(violation, before)
-                one, two = (dict(zip(self.names, x.at, strict=True)) for x in (before, after))
-                self.validity.forbid(before.mode, one, two, guilty, obstacle)
-                if after.alive:
-                    self.tree.cut(after)
+                self.orbits.refute(before, after, *self._guilty(violation, before))
 
     def _guilty(self, violation: Violation, node: Node) -> tuple[tuple[str, ...], str | None]:
         """The one or two robots that a violation is about, counting loads with their carriers, and what one hit."""

@@ -18,6 +18,8 @@ from mrtamp.explain import explain
 from mrtamp.growth import Growth
 from mrtamp.guidance import Choice, ModalGuidance
 from mrtamp.incumbent import Incumbent
+from mrtamp.intra_orbit.planners import INTRA_ORBIT
+from mrtamp.mechanisms import MECHANISMS
 from mrtamp.modes import Mode, start_mode
 from mrtamp.plan import Plan, Transition
 from mrtamp.portfolio import Portfolio
@@ -42,23 +44,12 @@ _FIRST_WAYS, _MORE_WAYS = (40, 14), (64, 20)
 """IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
 _REALISATIONS = 6
 """Skeletons that are tried at a time."""
+_REWIRINGS = 6
+"""Steps that may be validated for rewiring per insertion, once there is a plan."""
 _HOPE = 1.0
 """Skeletons are realised while their estimate is less than the incumbent's cost times this."""
 _TIE = 0.25
 """Difference of optimistic estimates within which guidance chooses at random."""
-
-
-MECHANISMS = {
-    "modal-guidance": "optimistic modal guidance before the first plan; without it orbits and transitions are random",
-    "orbit-path-guidance": "after the first plan, half of the search works along the incumbent's orbits",
-    "skeletons": "guidance that knows costs: whole skeletons from decoupled distances",
-    "coordination": "motions of a new plan begin as early as the others allow",
-    "refinement": "optimisation of plans once there are some",
-    "convex-programming": "the second half of refinement; without it plans are only shortened robot by robot",
-    "sliding": "transitions move along their strata in refinement",
-    "adoption": "refined configurations go back into the roadmaps and the tree",
-}
-"""Mechanisms that can be switched off by name, for ablation."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +62,7 @@ class Options:
     extensions : candidates the tree is extended to per iteration.
     persistent : share of iterations that ignore guidance, for ever.
     refinement_share : largest share of the time after the first plan that refinement may take.
+    intra_orbit : name of the planner of motion inside an orbit, see `INTRA_ORBIT`.
     without : names of mechanisms (see `MECHANISMS`) that are switched off.
     """
 
@@ -80,9 +72,12 @@ class Options:
     extensions: int = 3
     persistent: float = 0.1
     refinement_share: float = 0.85
+    intra_orbit: str = "tensor-tree"
     without: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
+        if self.intra_orbit not in INTRA_ORBIT:
+            raise MrtampError(f"intra_orbit: {self.intra_orbit!r} is unknown; choose from {', '.join(INTRA_ORBIT)}")
         unknown = sorted(self.without - set(MECHANISMS))
         if unknown:
             raise MrtampError(f"without: unknown mechanism {', '.join(unknown)}; choose from {', '.join(MECHANISMS)}")
@@ -130,7 +125,7 @@ class Planner:
         self.names = list(self.roadmaps)
         self.validity = Validity(problem, self.collision, self.roadmaps)
         self.sampler = TransitionSampler(problem, self.collision, self.roadmaps, self.validity, self.rng)
-        self.growth = Growth(problem, self.roadmaps, self.validity, self.rng)
+        self.growth = Growth(problem, self.roadmaps, self.validity, self.rng, self.options.intra_orbit)
         self.graphs, self.tree = self.growth.graphs, self.growth.tree
         self.guidance = ModalGuidance(problem, self.sampler, self.graphs)
         self.iteration = 0
@@ -410,7 +405,7 @@ class Planner:
             node = self._select_tensor_node(orbit, uniform=True)
             for _ in range(4):
                 if node is not None:
-                    node = self.growth.steering.random_step(node)
+                    node = self.growth.motion.explore(node)
 
     def _select_tensor_node(self, orbit: int, uniform: bool = False) -> Node | None:
         """A node of the orbit: usually the one it was entered by at the least cost, else any."""
@@ -427,6 +422,7 @@ class Planner:
         """Grow the sets of ways and realise the cheapest skeletons that may beat the incumbent, until one succeeds."""
         first = self.best is None
         self.skeletons.grow(*(_FIRST_WAYS if first else _MORE_WAYS))
+        self.skeletons.update_bound()
         for _ in range(_REALISATIONS):
             proposal: Proposal | None = next(self.skeletons.propose(_HOPE * self._cost()), None)
             if proposal is None:
@@ -468,11 +464,15 @@ class Planner:
             plan = self.incumbent.plan(segments, transitions)
             report = self.incumbent.judge(plan)
             if not report.ok:
+                branch = self.tree.branch(node)
                 self.growth.repair(report, groups)
-                if node.alive:
+                if node.alive and self.tree.branch(node) == branch:
+                    # Whatever is wrong is not a step that could be withdrawn.
                     self.tree.cut(node)
                 return False
         better = self.incumbent.offer(plan, self._elapsed())
+        if self._uses("rewiring"):
+            self.growth.orbits.rewirings = _REWIRINGS
         if better:
             self._path = [g[0].orbit for g in groups]
         if self._uses("refinement"):

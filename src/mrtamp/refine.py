@@ -26,10 +26,15 @@ from mrtamp.validity import Resting, Validity
 
 _KNOT = 0.3
 """Largest distance (rad) between knots after subdivision."""
+_MERGED = 0.12
+"""Longest step (rad) that comes of dropping a needless knot."""
 _LONGEST = 40
-_CONTACT = 0.07
-"""How far (m) the hand moves in the straight motions next to a change of attachment; they stay as they are."""
+_CONTACT = 0.015
+"""How far (m) the hand moves in the straight motions next to a change of attachment that stay as they are."""
+_NEAR, _FINER = 0.1, 8
+"""Within this distance (m) of such a change the hand's motion is sampled so many times as densely."""
 _STRAIGHT = 1e-6
+_SLICES = 20
 _RETIMED = 0.25
 """Share of proposals that are re-timings; of these, share that is searched on a grid."""
 _SEARCHED = 0.5
@@ -116,32 +121,43 @@ class Refiner:
         if action.after is None:
             return 0.0
         q, tool = self._q[robot], self.roadmaps[robot].world.tool
-        ends = range(knot, len(q)) if step > 0 else range(knot, -1, -1)
-        path = [q[knot]]
-        for k in ends:
-            if not np.array_equal(q[k], path[-1]):
-                path.append(q[k])
-        length = 0.0
-        direction = None
-        reach = np.linalg.norm(tool.pose(np.array(path))[1] - tool.pose(q[knot : knot + 1])[1], axis=1)
-        for n, (a, b) in enumerate(pairwise(path)):
-            way = float(np.linalg.norm(b - a))
-            unit = (b - a) / way
-            if direction is not None and (unit @ direction < 1 - _STRAIGHT or reach[n] > _CONTACT):
+        length, direction = 0.0, None
+        k = knot
+        while 0 <= k + step < len(q):
+            way = q[k + step] - q[k]
+            size = float(np.linalg.norm(way))
+            k += step
+            if size <= _EPS:
+                continue
+            if direction is not None and way @ direction < size * (1 - _STRAIGHT):
                 break
-            direction = unit
-            length += way
+            direction = way / size
+            t = np.linspace(0.0, 1.0, _SLICES + 1)
+            hand = tool.pose(q[k - step] + t[:, None] * way)[1]
+            away = np.flatnonzero(np.linalg.norm(hand - tool.pose(q[knot : knot + 1])[1], axis=1) >= _CONTACT)
+            if len(away):
+                return length + float(t[away[0]]) * size
+            length += size
         return length
 
     def _subdivide(self) -> None:
-        """Insert knots so that no step is longer than _KNOT."""
+        """Insert knots where motions that stay end, and so that no step is longer than _KNOT."""
         steps = np.array([np.linalg.norm(np.diff(q, axis=0), axis=1) for q in self._q.values()])
         if not steps.size:
             return
         pieces = np.maximum(1, np.ceil(steps.max(axis=0) / _KNOT)).astype(int)
-        starts = np.concatenate([[0], np.cumsum(pieces)])
-        t = np.concatenate([[k + j / n for j in range(n)] for k, n in enumerate(pieces)] + [[float(len(pieces))]])
+        ts = [k + j / n for k, n in enumerate(pieces.tolist()) for j in range(n)]
+        for h in self._events:
+            for robot, (before, after) in zip(h.action.robots, h.contact, strict=True):
+                own = steps[self.names.index(robot)]
+                along = np.concatenate([[0.0], np.cumsum(own)])
+                for x in (along[h.knot] - before, along[h.knot] + after):
+                    k = int(np.clip(np.searchsorted(along, x) - 1, 0, len(own) - 1))
+                    if own[k] > _EPS:
+                        ts.append(k + float(np.clip((x - along[k]) / own[k], 0.0, 1.0)))
+        t = np.unique([*ts, float(len(pieces))])
         low = np.minimum(t.astype(int), len(pieces) - 1)
+        starts = np.searchsorted(t, np.arange(len(pieces) + 1))
         for r, q in self._q.items():
             self._q[r] = q[low] + (t - low)[:, None] * (q[low + 1] - q[low])
             self._q[r][starts] = q
@@ -232,7 +248,7 @@ class Refiner:
                 la, lb = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
                 bend = np.linalg.norm(a * lb[:, None] - b * la[:, None], axis=1) / (la + lb)
                 peak = self._lengths.max(axis=0)
-                drop[1:-1] = (bend < 1e-10) & (peak[:-1] + peak[1:] <= _KNOT)
+                drop[1:-1] = (bend < 1e-10) & (peak[:-1] + peak[1:] <= _MERGED)
                 drop[[h.knot for h in self._events]] = False
                 for k in np.flatnonzero(drop[1:] & drop[:-1]) + 1:
                     # Of neighbouring knots only every other one: the rest is judged anew.
@@ -334,7 +350,17 @@ class Refiner:
                 and self.clearance.pair(own, self._track(other, self._q[other][i : j + 1], modes), steps) >= 0
             ):
                 return False
+        own.finer = self._close_to_contact(robot, own)
         return self.clearance.world(own, steps, [self.validity.resting(m) for m in modes], static=True) < 0
+
+    def _close_to_contact(self, robot: str, track: Track) -> np.ndarray:
+        """How many times as densely each step (M - 1,) has to be sampled."""
+        knots = [h.knot for h in self._events if robot in h.action.robots and h.action.after is not None]
+        if not knots:
+            return np.ones(len(track.q) - 1, dtype=int)
+        places = self.roadmaps[robot].world.tool.pose(self._q[robot][knots])[1]
+        gap = np.linalg.norm(track.hand[:, None] - places, axis=2).min(axis=1)
+        return np.where(np.minimum(gap[:-1], gap[1:]) < _NEAR, _FINER, 1)
 
     def _track(self, robot: str, q: np.ndarray, modes: Sequence[Mode]) -> Track:
         return Track(self.roadmaps[robot], q, [m.held.get(robot) for m in modes])

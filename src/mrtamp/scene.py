@@ -30,7 +30,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from mrtamp.kinematics import Chain, Tool, quaternions
 from mrtamp.model_files import make_parser
-from mrtamp.problem import CollisionRules, MovableObject, MrtampError, Problem, Robot, RobotModel, Shape, StaticBody
+from mrtamp.problem import MovableObject, MrtampError, Problem, Robot, RobotModel, Shape, StaticBody
 
 
 def drake_shape(shape: Shape) -> DrakeShape:
@@ -211,7 +211,7 @@ def build_scene(
         grown=grown,
     )
     # Last: growing a shape drops the filters it is in.
-    _filter_ignored(scene, problem.collision)
+    _filter_ignored(scene, problem)
     return scene
 
 
@@ -258,7 +258,10 @@ def bodies_of(scene: Scene, thing: str) -> list[RigidBody]:
     robot, _, body = thing.partition("/")
     if robot in scene.robots:
         bodies = robot_bodies(scene.plant, scene.robots[robot])
-        return [b for b in bodies if b.name() == body] if body else bodies
+        if body and body not in [b.name() for b in bodies]:
+            names = ", ".join(b.name() for b in bodies)
+            raise MrtampError(f"collision rules: found {thing!r}, expected one of the bodies of {robot}: {names}")
+        return [b for b in bodies if not body or b.name() == body]
     if thing in scene.statics:
         return scene.statics[thing]
     return [b for name, bodies in scene.free_bodies.items() if scene.stands_for[name] == thing for b in bodies]
@@ -278,10 +281,14 @@ def _filter_exceptions(
             manager.Apply(CollisionFilterDeclaration().ExcludeBetween(*sets))
 
 
-def _filter_ignored(scene: Scene, rules: CollisionRules) -> None:
+def _filter_ignored(scene: Scene, problem: Problem) -> None:
     """Apply the problem's collision rules as far as the plant holds both things of a pair."""
     manager = scene.scene_graph.collision_filter_manager()
-    for pair in rules.ignore:
+    known = [r.name for r in problem.robots] + [s.name for s in problem.statics] + [o.name for o in problem.objects]
+    for pair in problem.collision.ignore:
+        for thing in pair:
+            if thing.partition("/")[0] not in known:
+                raise MrtampError(f"collision rules: found {thing!r}, expected one of {', '.join(known)}")
         sets = [GeometrySet(geometry_ids(scene.plant, bodies_of(scene, thing))) for thing in pair]
         manager.Apply(CollisionFilterDeclaration().ExcludeBetween(*sets))
 

@@ -17,7 +17,7 @@ import numpy as np
 from pydrake.geometry import Box, Cylinder
 
 from mrtamp.planar import shortest_path, visibility_graph
-from mrtamp.problem import AtConfiguration, HandAt, MrtampError, Problem, RobotAt, Subgoal
+from mrtamp.problem import AtConfiguration, MrtampError, Problem, RobotAt, Subgoal
 from mrtamp.scene import Scene, build_scene, robot_bodies
 
 START = "start"
@@ -46,7 +46,7 @@ def timetable(problem: Problem, clearance: float = 0.0) -> Timetable:
 
     Parameters
     ----------
-    problem : robots that slide along x and y, with one cylinder each; no objects; subgoals at points.
+    problem : robots that slide along x and y, with one cylinder each; no objects; subgoals at configurations.
     clearance : metres by which the discs grow, for paths that keep a distance from the walls.
 
     Raises
@@ -101,11 +101,9 @@ def _legs(problem: Problem, scene: Scene, name: str, clearance: float) -> _Legs:
 def _point(problem: Problem, subgoal: Subgoal, robot: str) -> np.ndarray:
     """Where (2,) a subgoal wants a robot."""
     target = subgoal.targets[robot]
-    if isinstance(target, AtConfiguration):
-        return target.q
-    if isinstance(target, HandAt):
-        return (problem.robot(robot).X_WB.inverse() @ target.X_WG).translation()[:2]
-    raise MrtampError(f"{problem.name}: found a region as target of {subgoal.name}, expected a point")
+    if not isinstance(target, AtConfiguration):
+        raise MrtampError(f"{problem.name}: found a pose or a region in {subgoal.name}, expected configurations")
+    return target.q
 
 
 def _disc(problem: Problem, scene: Scene, name: str) -> tuple[float, tuple[float, float]]:

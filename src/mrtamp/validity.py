@@ -44,7 +44,7 @@ class Resting:
 
     name: str
     chain: tuple[Attachment, ...]
-    X_WO: np.ndarray
+    X_WO: np.ndarray = field(compare=False)
 
 
 class Validity:

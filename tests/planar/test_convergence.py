@@ -6,19 +6,22 @@ from xml.etree import ElementTree
 
 import pytest
 
-from mrtamp.convergence import KNOWN, Curve, Panel, drawing, mean_curve, optimum
+from mrtamp.convergence import KNOWN, ROUNDING, Curve, KnownOptimum, Panel, convergence, drawing, mean_curve, optimum
 from mrtamp.planner import Planner
 from mrtamp.problem_file import load_problem
 
 
 @pytest.mark.parametrize("row", KNOWN, ids=lambda row: row.problem)
-def test_planner_approaches_the_optimum_from_above(row):
-    planner = Planner(load_problem(row.problem), seed=0)
-    for _ in planner.improve(3.0):
-        pass
-    assert planner.best is not None
+def test_planner_comes_near_the_optimum_and_never_below(row: KnownOptimum):
+    """Stops as soon as it is near enough: the budget is for slow machines."""
     best = optimum(row.problem)
-    assert best * (1 - 1e-9) <= planner.best.cost <= best * (1 + 3 * row.within)
+    planner = Planner(load_problem(row.problem), seed=0)
+    for plan in planner.improve(20.0):
+        assert plan.cost >= best * (1 - ROUNDING)
+        if plan.cost <= best * (1 + 2 * row.within):
+            break
+    assert planner.best is not None
+    assert planner.best.cost <= best * (1 + 2 * row.within)
 
 
 def panel() -> Panel:
@@ -42,3 +45,11 @@ def test_plot_draws_every_run_the_mean_and_the_optimum():
     assert (kinds.count("r"), kinds.count("m"), kinds.count("o")) == (4, 2, 2)
     titles = [e.text for e in root.iter("{http://www.w3.org/2000/svg}text") if e.get("class") == "t"]
     assert titles == ["example: optimum 10.000"] * 2
+
+
+def test_table_has_a_row_per_problem_and_its_plot(tmp_path):
+    said: list[str] = []
+    row = KnownOptimum("square_free", 0.5, 0.5)
+    assert convergence(1, [row], said.append, tmp_path / "plot.svg")
+    assert "| square_free | 4.0600 | 1/1 |" in "\n".join(said)
+    assert "square_free: optimum 4.060" in (tmp_path / "plot.svg").read_text()

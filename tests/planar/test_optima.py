@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform
 from scheduled import Hold, scheduled_plan
 
 from mrtamp.check import check_plan
-from mrtamp.problem import Problem, Shape, StaticBody
+from mrtamp.problem import MrtampError, Problem, Shape, StaticBody
 from mrtamp.problem_file import load_problem
 from mrtamp.timetable import Timetable, timetable
 
@@ -100,3 +100,18 @@ def test_timetable_waits_for_predecessors(problem: Problem):
         for name, leg in zip(order, table.lengths[robot], strict=False):
             done += leg
             assert table.arrival[name] >= done - 1e-9
+
+
+def test_other_problems_have_no_timetable():
+    with pytest.raises(MrtampError, match="found objects, expected discs"):
+        timetable(load_problem("box"))
+    arms = load_problem("box")
+    with pytest.raises(MrtampError, match="found the robot left, expected a disc"):
+        timetable(dataclasses.replace(arms, objects=(), supports=(), goal=()))
+
+
+def test_a_robot_shut_in_has_no_timetable():
+    problem = load_problem("planar_doorway")
+    door = StaticBody("door", RigidTransform([0, 0, 0.15]), Shape("box", (0.1, 0.6, 0.3)))
+    with pytest.raises(MrtampError, match="cannot get from start to left_far"):
+        timetable(dataclasses.replace(problem, statics=(*problem.statics, door)))

@@ -13,6 +13,7 @@ import numpy as np
 
 from mrtamp.kinematics import inverse, rotation_vectors
 from mrtamp.modes import Attachment, Mode
+from mrtamp.optimise.screws import cross, transported
 from mrtamp.plan import Action, Transition
 from mrtamp.problem import WORLD, AtPose, InRegion, Problem
 from mrtamp.transitions.families import Family, GraspFamily, placement_families, residual
@@ -49,15 +50,7 @@ class Slide:
         omega = rotation_vectors(D[:, :3, :3]) / (2 * _STEP)
         middle = (X[:k, :3, 3] + X[k:, :3, 3]) / 2
         velocity = (X[:k, :3, 3] - X[k:, :3, 3]) / (2 * _STEP)
-        return np.concatenate([omega, velocity - np.cross(omega, middle)], axis=1)
-
-
-def transported(screws: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """Screws (..., k, 6) of frame P in the frame in which P has pose X (..., 4, 4)."""
-    R, p = X[..., None, :3, :3], X[..., None, :3, 3]
-    omega = (R @ screws[..., :3, None])[..., 0]
-    velocity = (R @ screws[..., 3:, None])[..., 0] + np.cross(p, omega)
-    return np.concatenate([omega, velocity], axis=-1)
+        return np.concatenate([omega, velocity - cross(omega, middle)], axis=1)
 
 
 class Choices:

@@ -14,8 +14,8 @@ import numpy as np
 from mrtamp.collision import RobotWorld
 from mrtamp.kinematics import inverse, matrix
 from mrtamp.modes import Mode
-from mrtamp.optimise.choices import Arrangement, transported
-from mrtamp.optimise.nearness import joint_screws
+from mrtamp.optimise.choices import Arrangement
+from mrtamp.optimise.screws import cross, joint_screws, transported, upstream
 from mrtamp.optimise.polyline import Polyline, Stretch
 from mrtamp.plan import Action
 from mrtamp.problem import HandAt, HandIn, Problem
@@ -46,6 +46,11 @@ class Closure:
         self.line = line
         self.pinned = pinned
         self._offsets = {s: self._offset(s, q) for s in line.stretches if s.far != s.near}
+        self._moves = {r: upstream(w.chain)[problem.robot(r).model.grasp_body] for r, w in worlds.items()}
+        knots: dict[str, set[int]] = {r: set() for r in line.columns}
+        for s in line.stretches:
+            knots[s.robot] |= {s.far, int(line.events[s.event])}
+        self._knots = {r: sorted(k) for r, k in knots.items()}
 
     def _offset(self, s: Stretch, q: np.ndarray) -> np.ndarray:
         """How the hand is away from the contact: in its own frame, or in the world's where it carries something."""
@@ -73,6 +78,7 @@ class Closure:
         """Rows that stay zero."""
         out = []
         size = q.size
+        hands = self._hands(q)
         for knot, action, before, after in self._actions(arrangement):
             if action.kind == "reach":
                 out += self._hands_at(knot, action, q)
@@ -82,34 +88,35 @@ class Closure:
             for sign, a, mode in ((1.0, action.before, before), (-1.0, action.after, after)):
                 assert a is not None
                 if a.held:
-                    cols = self.line.columns[a.parent]
-                    x = q[knot, cols][None]
-                    parts.append((self._knot(a.parent, knot), sign * self._tool_screws(a.parent, x)))
-                    X_WG = self.worlds[a.parent].tool.matrix(x)[0]
-                    origin = (X_WG @ a.X_PO)[:3, 3]
+                    X_WG, screws = hands[a.parent, knot]
+                    parts.append((self._knot(a.parent, knot), sign * screws))
+                    origin = X_WG[:3, :3] @ a.X_PO[:3, 3] + X_WG[:3, 3]
                     slide = arrangement.slide(a)
                     if slide is not None:
-                        screws = transported(arrangement.own_screws(a), X_WG)
-                        parts.append((size + np.arange(slide.columns.start, slide.columns.stop), sign * screws))
+                        moved = transported(arrangement.own_screws(a), X_WG)
+                        parts.append((size + np.arange(slide.columns.start, slide.columns.stop), sign * moved))
                 else:
-                    for columns, screws in arrangement.world_screws(mode.chain(a.object)):
-                        parts.append((size + np.arange(columns.start, columns.stop), sign * screws))
+                    for columns, moved in arrangement.world_screws(mode.chain(a.object)):
+                        parts.append((size + np.arange(columns.start, columns.stop), sign * moved))
             out.append(_rows([(i, _at(s, origin)) for i, s in parts]))
         for s in self._offsets:
-            cols, knot = self.line.columns[s.robot], int(self.line.events[s.event])
-            x = q[[knot, s.far], cols]
-            p = self.worlds[s.robot].tool.pose(x)[1]
-            screws = [self._tool_screws(s.robot, x[[0]]), self._tool_screws(s.robot, x[[1]])]
-            there = p[1] if s.hand == "lifting" else p[0]
-            parts = [(self._knot(s.robot, knot), -_at(screws[0], p[0])), (self._knot(s.robot, s.far), _at(screws[1], there))]
-            out.append(_rows(parts))
+            knot = int(self.line.events[s.event])
+            (X_WE, near), (X_WF, far) = hands[s.robot, knot], hands[s.robot, s.far]
+            there = X_WF if s.hand == "lifting" else X_WE
+            moved = [-_at(near, X_WE[:3, 3]), _at(far, there[:3, 3])]
+            out.append(_rows([(self._knot(s.robot, knot), moved[0]), (self._knot(s.robot, s.far), moved[1])]))
         return out
 
-    def _tool_screws(self, robot: str, x: np.ndarray) -> np.ndarray:
-        """Screws (n, 6) of the joints that move the hand, at one configuration x (1, n)."""
-        tool = self.worlds[robot].tool
-        moves = np.abs(tool.jacobian(x)[2][0]).max(axis=0) > 0
-        return joint_screws(self.worlds[robot].chain, x)[0] * moves[:, None]
+    def _hands(self, q: np.ndarray) -> dict[tuple[str, int], tuple[np.ndarray, np.ndarray]]:
+        """X_WG (4, 4) and the screws (n, 6) of the joints that move it, for every robot at its contact knots."""
+        out = {}
+        for robot, knots in self._knots.items():
+            if knots:
+                x = q[knots, self.line.columns[robot]]
+                world = self.worlds[robot]
+                screws = joint_screws(world.chain, x) * self._moves[robot][:, None]
+                out.update({(robot, k): (X, S) for k, X, S in zip(knots, world.tool.matrix(x), screws, strict=True)})
+        return out
 
     def _targets(self, action: Action) -> Iterator[tuple[str, HandAt | HandIn]]:
         if action.subgoal is None:
@@ -123,8 +130,7 @@ class Closure:
         for robot, target in self._targets(action):
             if isinstance(target, HandAt) and self._free(robot, knot):
                 x = q[knot, self.line.columns[robot]][None]
-                p = self.worlds[robot].tool.pose(x)[1][0]
-                out.append(_rows([(self._knot(robot, knot), _at(self._tool_screws(robot, x), p))]))
+                out.append(Rows(self._knot(robot, knot), self.worlds[robot].tool.jacobian(x)[2][0]))
         return out
 
     def inequalities(self, q: np.ndarray, arrangement: Arrangement) -> list[Rows]:
@@ -235,7 +241,7 @@ class Closure:
 
 def _at(screws: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Rows (6, k) of angular velocity and the velocity at point p (3,) for screws (k, 6)."""
-    return np.concatenate([screws[:, :3], screws[:, 3:] + np.cross(screws[:, :3], p)], axis=1).T
+    return np.concatenate([screws[:, :3], screws[:, 3:] + cross(screws[:, :3], p)], axis=1).T
 
 
 def _rows(parts: list[tuple[np.ndarray, np.ndarray]]) -> Rows:
@@ -244,5 +250,7 @@ def _rows(parts: list[tuple[np.ndarray, np.ndarray]]) -> Rows:
 
 def independent(block: np.ndarray) -> np.ndarray:
     """Orthonormal rows that span those of `block` (m, n)."""
+    if not block.size:
+        return block[:0]
     _, size, V = np.linalg.svd(block, full_matrices=False)
     return V[size > _LEVEL * max(float(size.max(initial=0.0)), 1.0)]

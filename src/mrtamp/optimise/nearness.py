@@ -15,9 +15,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
 from mrtamp.collision import Collision, write_held
-from mrtamp.kinematics import Chain
 from mrtamp.modes import Attachment, Mode
-from mrtamp.optimise.choices import Arrangement, transported
+from mrtamp.optimise.choices import Arrangement
+from mrtamp.optimise.screws import cross, joint_screws, transported, upstream
 from mrtamp.scene import Scene, geometry_ids, robot_bodies
 
 CULL = 0.02
@@ -32,6 +32,11 @@ class Samples:
     lo: np.ndarray
     t: np.ndarray
     segment: np.ndarray
+
+    @classmethod
+    def none(cls) -> Samples:
+        """No samples."""
+        return cls(np.zeros(0, dtype=int), np.zeros(0), np.zeros(0, dtype=int))
 
     def __len__(self) -> int:
         return len(self.lo)
@@ -82,7 +87,7 @@ class Carriers:
         """Robot -> which joints (columns) move which carrier (rows), 0 or 1."""
         for name, world in collision.worlds.items():
             table = np.zeros((len(self.number), world.chain.n))
-            masks = _upstream(world.chain)
+            masks = upstream(world.chain)
             for body, mask in masks.items():
                 table[self.number["link", name, body]] = mask
             table[self.number["held", name]] = masks[problem.robot(name).model.grasp_body]
@@ -109,28 +114,6 @@ class Carriers:
         return out
 
 
-def _upstream(chain: Chain) -> dict[str, np.ndarray]:
-    masks: list[np.ndarray] = []
-    for link in chain._links:
-        mask = np.zeros(chain.n) if link.parent < 0 else masks[link.parent].copy()
-        if link.column >= 0:
-            mask[link.column] = 1.0
-        masks.append(mask)
-    return {body: masks[chain._index[body]] for body in chain.bodies}
-
-
-def joint_screws(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Screws (N, n, 6) of all joints in W at q (N, n): angular, and linear velocity at the world's origin."""
-    out = np.zeros((len(q), chain.n, 6))
-    for column, axis, origin in chain._sweep(q)[2]:
-        if chain.prismatic[column]:
-            out[:, column, 3:] = axis
-        else:
-            out[:, column, :3] = axis
-            out[:, column, 3:] = np.cross(origin, axis)
-    return out
-
-
 def _ask(
     plant: MultibodyPlant, context: Context, rows: np.ndarray, carrier: dict, reach: float, kept: np.ndarray
 ) -> Near:
@@ -155,7 +138,7 @@ def _ask(
             a.append(x)
             b.append(y)
     n, p = np.array(normal).reshape(-1, 3), np.array(point).reshape(-1, 3)
-    wrench = np.concatenate([np.cross(p, n), n], axis=1)
+    wrench = np.concatenate([cross(p, n), n], axis=1)
     return Near(np.array(sample, dtype=int), np.array(distance), wrench, np.array(a, dtype=int), np.array(b, dtype=int))
 
 

@@ -16,7 +16,7 @@ from scipy import sparse
 from mrtamp.check_report import Report, Violation
 from mrtamp.collision import Collision
 from mrtamp.optimise.choices import Arrangement, Choices
-from mrtamp.optimise.closure import Closure, independent
+from mrtamp.optimise.closure import Closure, Rows, independent
 from mrtamp.optimise.fine import FineCheck, Violations, Who, contact_of, knot_samples
 from mrtamp.optimise.nearness import Near, Nearness, Samples
 from mrtamp.optimise.polyline import Polyline, load
@@ -26,11 +26,16 @@ from mrtamp.plan import Segment, Transition
 from mrtamp.problem import Problem
 from mrtamp.transitions.families import GraspFamily
 
+Demands = dict[Who, dict[tuple[int, float, int], int]]
+"""Who -> (step, fraction, segment) -> by how many millimetres more they shall be clear there."""
+
 TRUST = 0.2
 """First radius (rad) of the trust region of every joint."""
 _LARGEST, _SMALLEST = 0.4, 0.01
 _DEEP = 0.03
 """Penetration (m) at which a step is rejected."""
+_SHALLOW = 1e-3
+"""Penetration (m) at the program's own samples that makes a finer look pointless."""
 _NEAR = 0.06
 """Distance (m) below which pairs of solids enter the program."""
 _MARGIN = 1.5e-3
@@ -59,6 +64,11 @@ class _Collisions:
     A: sparse.csr_array
     gap: np.ndarray
     deepest: float
+
+    def joined(self, other: _Collisions) -> _Collisions:
+        """These rows and others."""
+        A = sparse.csr_array(sparse.vstack([self.A, other.A]))
+        return _Collisions(A, np.concatenate([self.gap, other.gap]), max(self.deepest, other.deepest))
 
 
 class Optimiser:
@@ -100,7 +110,7 @@ class Optimiser:
         self.trust = TRUST
         self.converged = False
         self._stalls = 0
-        self._extra: dict[Who, dict[tuple[int, float, int], int]] = {}
+        self._extra: Demands = {}
         self._changes = sum(self.weights.transitions.get(a.kind, 0.0) for t in transitions for a in t.actions)
         self.choices = Choices(problem, [s.mode for s in segments], transitions, families if slide else {})
         if not slide:
@@ -173,28 +183,30 @@ class Optimiser:
             return 0.0
         now = self._now
         if self._collisions is None:
-            self._collisions = self._linearise(now)
+            self._collisions = self._linearise(now, *self._demands(now.line))
         self.steps += 1
         candidate = self._solve(now, self._collisions)
         if candidate is None:
             return self._reject()
-        violations = self.fine.violations(candidate.line, candidate.q, candidate.arrangement)
-        kept = {who: dict(x) for who, x in self._extra.items()}
-        self._learn(violations)
-        collisions = self._linearise(candidate)
+        collisions = self._linearise(candidate, *self._demands(candidate.line))
         if collisions.deepest > _DEEP and collisions.deepest > self._collisions.deepest:
-            self._extra = kept
             return self._reject()
+        clean = collisions.deepest < _SHALLOW
+        if clean:
+            violations = self.fine.violations(candidate.line, candidate.q, candidate.arrangement)
+            if violations:
+                clean = False
+                fresh = self._learn(violations)
+                collisions = collisions.joined(self._linearise(candidate, Samples.none(), fresh))
         before = self._merit(now, self._collisions)
         after = self._merit(candidate, collisions)
         self._now, self._collisions = candidate, collisions
         gain = 0.0
-        if not violations and candidate.cost < self._best.cost - 1e-9:
+        if clean and candidate.cost < self._best.cost - 1e-9:
             gain = self._best.cost - candidate.cost
             self._best = candidate
         self._pace((before - after) / max(before, 1e-9), gain)
-        lengths = candidate.line.lengths(candidate.q).max(axis=0)
-        if lengths.max() > 1.4 * self.knot or (lengths < 0.1 * self.knot).mean() > 0.4:
+        if candidate.line.lengths(candidate.q).max() > 1.4 * self.knot:
             self._resample()
         return gain
 
@@ -220,9 +232,8 @@ class Optimiser:
         scale = self.choices.scale
         whole = sparse.csr_array(sparse.block_diag([E, sparse.diags_array(scale)])) if count else E
         lower, upper = self._box(now)
-        equal = self._blocks([(r.columns, r.block, None) for r in self._closure.equalities(now.q, now.arrangement)], whole)
-        more = [(r.columns, r.block, r.lower) for r in self._closure.inequalities(now.q, now.arrangement)]
-        F, g = self._stacked(more, whole)
+        equal = self._stacked(self._closure.equalities(now.q, now.arrangement), n + count)[0]
+        F, g = self._stacked(self._closure.inequalities(now.q, now.arrangement), n + count)
         rows = Linearised(
             sparse.csr_array(collisions.A @ whole), -collisions.gap, equal, F, g, lower, upper
         )
@@ -252,60 +263,69 @@ class Optimiser:
             np.concatenate([upper, np.clip((most - c) / scale, 0.0, self.trust)]),
         )
 
-    def _blocks(self, parts: list, whole: sparse.csr_array) -> sparse.csr_array:
-        """Equality rows over the independent variables, redundant ones dropped."""
-        out = []
-        for columns, block, _ in parts:
-            reduced = sparse.csr_array(block @ whole[columns])
-            used = np.unique(reduced.indices)
-            if not len(used):
-                continue
-            basis = independent(reduced[:, used].toarray())
-            if len(basis):
-                entries = (basis.reshape(-1), (np.repeat(np.arange(len(basis)), len(used)), np.tile(used, len(basis))))
-                out.append(sparse.csr_array(entries, shape=(len(basis), whole.shape[1])))
-        return sparse.csr_array(sparse.vstack(out)) if out else sparse.csr_array((0, whole.shape[1]))
-
-    def _stacked(self, parts: list, whole: sparse.csr_array) -> tuple[sparse.csr_array, np.ndarray]:
-        if not parts:
-            return sparse.csr_array((0, whole.shape[1])), np.zeros(0)
-        rows = [sparse.csr_array(block @ whole[columns]) for columns, block, _ in parts]
-        return sparse.csr_array(sparse.vstack(rows)), np.concatenate([lower for _, _, lower in parts])
+    def _stacked(self, parts: Sequence[Rows], n: int) -> tuple[sparse.csr_array, np.ndarray]:
+        """Rows over the n independent variables; equalities without the redundant ones."""
+        values, rows, columns, lower = [np.zeros(0)], [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
+        own = len(self._reduction.knot)
+        variable = np.concatenate([self._reduction.variable, own + np.arange(self.choices.count)])
+        scale = np.concatenate([np.ones(len(self._reduction.variable)), self.choices.scale])
+        m = 0
+        for part in parts:
+            used = variable[part.columns] >= 0
+            block = part.block[:, used] * scale[part.columns[used]]
+            if part.lower is None:
+                block = independent(block)
+            values.append(block.reshape(-1))
+            rows.append(np.repeat(m + np.arange(len(block)), block.shape[1]))
+            columns.append(np.tile(variable[part.columns[used]], len(block)))
+            lower.append(np.zeros(len(block)) if part.lower is None else part.lower)
+            m += len(block)
+        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+        return sparse.csr_array(entries, shape=(m, n)), np.concatenate(lower)
 
     # -- collisions -------------------------------------------------------------------------------------------------
 
-    def _learn(self, violations: Sequence[Violations]) -> None:
+    def _learn(self, violations: Sequence[Violations]) -> Demands:
         """Every violating sample becomes a row of the next programs, stricter each time it recurs."""
+        fresh: Demands = {}
         for v in violations:
             for lo, t, s in zip(v.samples.lo.tolist(), v.samples.t.tolist(), v.samples.segment.tolist(), strict=True):
-                self._demand(v.who, lo, t, s, 1)
+                key = self._demand(v.who, lo, t, s, 1)
+                fresh.setdefault(v.who, {})[key] = self._extra[v.who][key]
+        return fresh
 
-    def _demand(self, who: Who, lo: int, t: float, segment: int, more: int) -> None:
+    def _demand(self, who: Who, lo: int, t: float, segment: int, more: int) -> tuple[int, float, int]:
         rows = self._extra.setdefault(who, {})
         key = (lo, round(t * 12) / 12, segment)
         rows[key] = rows.get(key, 0) + more
+        return key
 
-    def _samples(self, base: Samples, who: Who) -> tuple[Samples, np.ndarray]:
+    def _demands(self, line: Polyline) -> tuple[Samples, Demands]:
+        """Knots and midpoints, and what violations have taught."""
+        return knot_samples(line, np.full(line.knots - 1, 2)), self._extra
+
+    def _samples(self, base: Samples, extra: Mapping[tuple[int, float, int], int]) -> tuple[Samples, np.ndarray]:
         """The samples of a query and the clearance (S,) asked for at each."""
-        margin = np.full(len(base), _MARGIN - 0.25 * self.problem.collision.tolerance)
-        extra = self._extra.get(who)
+        least = _MARGIN - 0.25 * self.problem.collision.tolerance
+        margin = np.full(len(base), least)
         if not extra:
             return base, margin
         lo, t, segment = (np.array(x) for x in zip(*extra, strict=True))
-        strict = margin[0] + _STRICTER * np.array(list(extra.values()))
+        strict = least + _STRICTER * np.array(list(extra.values()))
         return base.joined(Samples(lo, t, segment)), np.concatenate([margin, strict])
 
-    def _linearise(self, at: Iterate) -> _Collisions:
-        """Distances and their gradients at knots, midpoints, and wherever something was violated."""
+    def _linearise(self, at: Iterate, base: Samples, demands: Demands) -> _Collisions:
+        """Distances and their gradients at the samples of `base` for all, and at those that `demands` adds."""
         line, q, arrangement = at.line, at.q, at.arrangement
-        base = knot_samples(line, np.full(line.knots - 1, 2))
         blocks: list[sparse.csr_array] = []
         gaps: list[np.ndarray] = []
         deepest = 0.0
         names = list(line.columns)
         for i, robot in enumerate(names):
             for who in [(robot,), *((other, robot) for other in names[:i])]:
-                samples, margin = self._samples(base, who)
+                samples, margin = self._samples(base, demands.get(who, {}))
+                if not len(samples):
+                    continue
                 knots = {r: q[:, line.columns[r]] for r in who}
                 if len(who) == 1:
                     near = self.nearness.world(robot, knots[robot], samples, arrangement, _NEAR)
@@ -383,7 +403,7 @@ class Optimiser:
         line = Polyline(now.line.columns, now.q, now.line.events, now.line.stretches)
         u = line.resampled(self.knot)
         fresh = line.at(u)
-        moved: dict[Who, dict[tuple[int, float, int], int]] = {}
+        moved: Demands = {}
         for who, rows in self._extra.items():
             moved[who] = {}
             for (lo, t, segment), strict in rows.items():

@@ -17,18 +17,22 @@ PENALTY = 20.0
 _TINY = 1e-4
 """Share of the makespan's weight that shapes idle motion where path length has no weight."""
 _TOLERANCE = 1e-4
+import os
+_PROX=float(os.environ.get("PROX","0"))
 
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
     """Displacements of all knots, flattened (K * N,), as E z of independent variables z (n,).
 
-    `knot` (n,) and `column` (n,) say which joint at which knot a variable moves; `cones` holds for every step and robot
+    `variable` (K * N,) is the one that is the displacement of a knot's joint itself, -1 where none is; `knot` (n,) and
+    `column` (n,) say which joint at which knot a variable moves; `cones` holds for every step and robot
     that can change: row among all lengths, the variables, and the matrix from them to the change of the joint vector.
     """
 
     line: Polyline
     E: sparse.csr_array
+    variable: np.ndarray
     knot: np.ndarray
     column: np.ndarray
     cones: list[tuple[int, np.ndarray, np.ndarray]]
@@ -82,7 +86,9 @@ def reduce(line: Polyline, pinned: Mapping[str, np.ndarray]) -> Reduction:
             used = np.unique(part.indices)
             if len(used):
                 cones.append((r * (K - 1) + k, used, part[:, used].toarray()))
-    return Reduction(line, E, np.array(knots, dtype=int), np.array(joints, dtype=int), cones)
+    variable = np.full(K * N, -1)
+    variable[np.array(knots, dtype=int) * N + np.array(joints, dtype=int)] = np.arange(n)
+    return Reduction(line, E, variable, np.array(knots, dtype=int), np.array(joints, dtype=int), cones)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +142,10 @@ def solve(reduction: Reduction, q: np.ndarray, weights: CostWeights, rows: Linea
         b[1:] = dq[k, cols]
         program.AddLorentzConeConstraint(A, b, np.append(x[used], x[length + row]))
         low[length + row], high[length + row] = 0.0, np.inf
+    if _PROX:
+        w = program.NewContinuousVariables(1)
+        program.AddLinearCost(np.array([_PROX * (long + short)]), w)
+        program.AddLorentzConeConstraint(np.append(w, x[:n]))
     if long > 0:
         each = np.arange(robots * steps)
         entries = (np.concatenate([np.ones(len(each)), -np.ones(len(each))]),
