@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from discs import HEIGHT, Errands, disc_problem, errand
+from discs import HEIGHT, RADIUS, Errands, disc_problem, errand
 from gantry import Script, gantry_problem, grasp
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from mrtamp.check import Report, check_plan
+from mrtamp.collision import Collision
 from mrtamp.modes import Attachment
 from mrtamp.plan import Plan, Segment, Transition
 from mrtamp.problem import WORLD, AtConfiguration, Attach, CollisionRules, Problem, Shape, StaticBody, Subgoal
@@ -271,3 +272,30 @@ def test_objects_at_rest_count_towards_the_tolerance(tmp_path: Path) -> None:
     assert "cube and block collide at rest, 2.00 mm deep" in str(report(0.0))
     assert not report(0.0019).ok
     assert report(0.0021).ok
+
+
+def test_the_judge_and_the_planners_plants_agree_with_the_formula(problem: Problem) -> None:
+    """Two discs and a wall, at random: penetrations in closed form, against the judge's sum and each plant's own."""
+    rng = np.random.default_rng(0)
+    verdicts = set()
+    for _ in range(60):
+        tolerance = float(rng.choice([0.0, 0.01, 0.03]))
+        a = np.array([rng.uniform(-0.7, 0.1), rng.uniform(0.22, 0.27)])
+        angle, gap = rng.uniform(0.3, 2.8), rng.uniform(-0.03, 0.02)
+        b = a + (2 * RADIUS + gap) * np.array([np.cos(angle), np.sin(angle)])
+        into_wall, into_disc = max(0.05 + RADIUS - a[1], 0.0), max(-gap, 0.0)
+        if min(abs(x - tolerance) for x in (into_wall, into_disc, into_wall + into_disc)) < 2e-4:
+            continue  # Drake's depths are good to 2e-5
+        robots = tuple(dataclasses.replace(r, start=q) for r, q in zip(problem.robots, (a, b), strict=True))
+        rules = CollisionRules((), tolerance)
+        here = dataclasses.replace(problem, robots=robots, subgoals=(), goal=(), objects=(), collision=rules)
+        plan = Errands(here).move(a=(a[0], a[1] + 1e-5)).plan()
+        assert check_plan(plan).ok == (into_wall + into_disc <= tolerance)
+        collision = Collision(here)
+        world = collision.worlds["a"]
+        assert world.hits(world.rows(a[None], None, {}))[0] == (into_wall > tolerance)
+        pair, _ = collision.pair("a", "b")
+        hit = pair.first_hit(a[None], None, b[None], None, exact=np.array([True])) == 0
+        assert hit == (into_disc > tolerance)
+        verdicts.add((into_wall > 0, into_disc > 0, into_wall + into_disc <= tolerance))
+    assert len(verdicts) >= 6

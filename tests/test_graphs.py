@@ -70,3 +70,21 @@ def test_union_find_is_the_connected_components() -> None:
         assert {graphs.find(o) for o in component} == {min(component)}
     assert len(graphs.orbital) == nx.number_connected_components(truth)
     assert sorted(graphs.orbits_of[mode("left").state]) == sorted(graphs.orbital)
+
+
+def test_a_split_makes_orbits_of_the_same_mode_and_edges_follow_the_count() -> None:
+    graphs = Graphs()
+    start, held = graphs.add_orbit(mode("floor")), graphs.add_orbit(mode("left"))
+    end = graphs.add_orbit(mode("right"))
+    for _ in range(3):
+        graphs.transition(start, held)
+    graphs.transition(held, end)
+    parts = graphs.split(held, 2)
+    assert len({held, *parts}) == 3
+    assert all(graphs.mode(o) is graphs.mode(held) and graphs.find(o) == o for o in parts)
+    assert graphs.orbits_of[mode("left").state] == [held, *parts]
+    graphs.recount([held, *parts], {(start, held): 1, (start, parts[0]): 2, (parts[1], end): 1})
+    counts = {(a, b): data["count"] for a, b, data in graphs.orbital.edges(data=True)}
+    assert counts == {(start, held): 1, (start, parts[0]): 2, (parts[1], end): 1}
+    assert graphs.merge(parts[0], held) == held
+    assert graphs.orbital.edges[start, held]["count"] == 3

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from discs import disc_problem, errand
+from gantry import gantry_problem
 from sketches import sketch
 
 from mrtamp import report
@@ -59,6 +60,13 @@ def test_subgoals_have_words_too(tmp_path: Path) -> None:
     together = dataclasses.replace(rows[1], robots=("a", "b"))
     assert together.sentence == "a and b reach take and b takes token"
     assert json.loads(json.dumps(report.summary(plan)))["timeline"][1]["subgoal"] == "take"
+
+
+def test_lengths_have_the_unit_of_the_joints(plan: Plan, tmp_path: Path) -> None:
+    assert " rad, path length " in report.cost_text(plan)
+    assert " m, path length " in report.cost_text(errand(disc_problem(tmp_path)))
+    gantries = standstill(gantry_problem(tmp_path))
+    assert "(makespan 0.000, path length 0.000)" in report.cost_text(gantries), "its joints slide and turn"
 
 
 def test_a_plan_without_transitions_has_words_too(plan: Plan) -> None:

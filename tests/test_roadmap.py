@@ -10,7 +10,7 @@ import pytest
 
 from mrtamp.collision import RESOLUTION, Counts, RobotWorld
 from mrtamp.problem import Problem, Robot
-from mrtamp.roadmap import Roadmap, lazy_path
+from mrtamp.roadmap import Roadmap, lazy_path, prm_star_neighbours
 from mrtamp.robot_file import load_robot_model
 from mrtamp.scene import RigidTransform
 
@@ -128,18 +128,73 @@ def test_no_tracked_point_moves_more_than_the_resolution_between_samples(roadmap
     assert max(worst) <= 1.02 * RESOLUTION, f"{max(worst) * 1e3:.1f} mm"
 
 
-def test_neighbours_grow_with_the_logarithm(roadmap: Roadmap) -> None:
-    """PRM* asks for k >= e (1 + 1/d) log n."""
-    n = len(roadmap.open_vertices())
-    degree = np.array([len(roadmap.neighbours(v)) for v in range(n)])
-    k = np.e * (1 + 1 / 7) * np.log(n)
-    assert degree[-1] >= k
-    assert degree.mean() < 4 * k
+def test_new_vertices_are_joined_to_their_nearest_as_prm_star_asks(world: RobotWorld) -> None:
+    """k > e (1 + 1/d) log n for every n, the very k nearest of the open vertices, and no more."""
+    roadmap = Roadmap(world)
+    rng = np.random.default_rng(4)
+    for n in range(200):
+        q = rng.uniform(world.chain.lower, world.chain.upper)
+        before = roadmap.n_edges
+        v = roadmap.add_vertex(q)
+        k = min(n, prm_star_neighbours(n, 7)) if n else 0
+        assert n < 2 or k == n or k > np.e * (1 + 1 / 7) * np.log(n)
+        assert roadmap.n_edges - before == k
+        nearest = np.argsort(np.linalg.norm(roadmap.q[:n] - q, axis=1))[:k]
+        assert set(roadmap.neighbours(v)) == set(nearest.tolist())
+    assert prm_star_neighbours(10**6, 7) < 3 * prm_star_neighbours(10**3, 7), "with the logarithm"
+
+
+def test_searches_between_which_the_roadmap_grows_are_dijkstras(world: RobotWorld) -> None:
+    """Vertices, edges and blocked sets come and go between searches; the graph behind them keeps up."""
+    roadmap = Roadmap(world)
+    roadmap.add_vertex(world.home)
+    rng = np.random.default_rng(5)
+    for _ in range(60):
+        for _ in range(int(rng.integers(4))):
+            roadmap.add_vertex(rng.uniform(world.chain.lower, world.chain.upper), connect=bool(rng.random() < 0.9))
+        for _ in range(int(rng.integers(12))):
+            a, b = (int(x) for x in rng.integers(roadmap.n_vertices, size=2))
+            roadmap.edge(a, b)
+        blocked = rng.random(roadmap.n_edges) < rng.choice([0.0, 0.4, 0.8])
+        graph = as_graph(roadmap, blocked)
+        target, start = (int(x) for x in rng.integers(roadmap.n_vertices, size=2))
+        truth = nx.single_source_dijkstra_path_length(graph, target)
+        distance = roadmap.distances_to(target, blocked)
+        assert distance.shape == (roadmap.n_vertices,)
+        assert {v: d for v, d in enumerate(distance) if np.isfinite(d)} == pytest.approx(truth)
+        path = roadmap.shortest(start, target, blocked)
+        assert (path is None) == (start not in truth)
+        if path is not None:
+            assert length(roadmap, path) == pytest.approx(truth[start])
+            assert all(roadmap.length(a, b) == graph.edges[a, b]["weight"] for a, b in pairwise(path))
+        everything = as_graph(roadmap, np.zeros(roadmap.n_edges, dtype=bool))
+        for v in everything:
+            assert sorted(roadmap.neighbours(v)) == sorted(everything[v])
+
+
+def test_edges_made_while_a_search_runs_are_not_blocked(roadmap: Roadmap) -> None:
+    blocked = np.ones(roadmap.n_edges, dtype=bool)
+    roadmap.edge(0, 150)
+    assert roadmap.shortest(0, 150, blocked) == [0, 150]
+
+
+def test_lengths_are_distances_whether_there_is_an_edge_or_not(roadmap: Roadmap) -> None:
+    for a, b in ((3, 3), (0, 149), (149, 0), (17, 80)):
+        assert roadmap.length(a, b) == pytest.approx(np.linalg.norm(roadmap.q[a] - roadmap.q[b]))
+
+
+def test_old_spheres_are_forgotten_and_computed_again(roadmap: Roadmap, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mrtamp.roadmap._KEPT_SPHERES", 5)
+    first = roadmap.spheres(0).copy()
+    for e in range(1, 9):
+        roadmap.spheres(e)
+    assert len(roadmap._spheres) == 5
+    np.testing.assert_array_equal(roadmap.spheres(0), first)
 
 
 def test_unconnected_vertices_are_reached_through_their_exits_only(roadmap: Roadmap) -> None:
     v = roadmap.add_vertex(roadmap.q[0] + 0.2, connect=False)
-    assert roadmap.neighbours(v) == []
+    assert not roadmap.neighbours(v)
     assert v not in roadmap.open_vertices()
     exit_ = roadmap.add_vertex(roadmap.q[0] + 0.15)
     roadmap.edge(v, exit_)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from types import SimpleNamespace
 
+import networkx as nx
 import numpy as np
 import pytest
 
@@ -49,6 +50,17 @@ def check(tree: TensorTree) -> None:
     assert all(node.orbit == orbit for orbit, nodes in tree.of_orbit.items() for node in nodes)
 
 
+def cheapest(tree: TensorTree) -> dict[Node, float]:
+    """Dijkstra over everything that was proved."""
+    graph = nx.DiGraph()
+    for x in tree.nodes:
+        if x.alive:
+            graph.add_node(x)
+            graph.add_weighted_edges_from((x, y, cost) for y, cost in x.steps.items())
+            graph.add_weighted_edges_from((y, x, cost) for y, (_, cost) in x.entries.items())
+    return nx.single_source_dijkstra_path_length(graph, tree.nodes[0])
+
+
 def grow(tree: TensorTree, steps: int, seed: int, cuts: bool) -> None:
     """Random insertions and rewirings in two modes, with picks between them, now and then a cut."""
     rng = np.random.default_rng(seed)
@@ -59,6 +71,8 @@ def grow(tree: TensorTree, steps: int, seed: int, cuts: bool) -> None:
             tree.insert_transition(parent, PICK, AFTER, 1, WEIGHTS.transitions["pick"])
         elif cuts and parent.parent is not None and rng.random() < 0.05:
             tree.cut(parent)
+        elif cuts and parent.steps and rng.random() < 0.1:
+            tree.refute([(parent, list(parent.steps)[int(rng.integers(len(parent.steps)))])])
         else:
             at = tuple(int(v) for v in rng.integers(6, size=2))
             tree.insert(parent, at)
@@ -72,6 +86,7 @@ def test_costs_and_structure_survive_random_growth(seed: int, cuts: bool) -> Non
     for round_ in range(6):
         grow(tree, 60, 10 * seed + round_, cuts)
         check(tree)
+        assert {n: n.cost for n in tree.nodes if n.alive} == pytest.approx(cheapest(tree))
     assert len(tree.nodes) > 30
 
 
@@ -137,6 +152,42 @@ def test_a_cut_removes_the_whole_subtree_and_its_place_may_be_taken_again() -> N
     assert tree.of_orbit.get(1, []) == []
     back, new = tree.insert(other, (2, 1))
     assert new and back is not b
+    check(tree)
+
+
+def test_a_refuted_step_is_replaced_by_the_cheapest_other_proof() -> None:
+    tree = a_tree()
+    root = tree.add_root(BEFORE, (0, 0), 0)
+    a, _ = tree.insert(root, (1, 1))
+    end, _ = tree.insert(a, (2, 2))
+    held = tree.insert_transition(end, PICK, AFTER, 1, 0.5)
+    only, _ = tree.insert(end, (5, 5))
+    others = [tree.insert(root, at)[0] for at in ((3, 3), (4, 4))]
+    for x in others:
+        tree.insert(x, (2, 2))
+    best = min(others, key=lambda x: x.cost + tree.step_cost(x.at, end.at))
+    assert tree.refute([(a, end)]) == []
+    assert end.parent is best
+    assert held.cost == pytest.approx(best.cost + tree.step_cost(best.at, end.at) + 0.5)
+    check(tree)
+    assert set(tree.refute([(x, end) for x in others])) == {end, held, only}
+    assert not any(x.alive for x in (end, held, only)) and all(x.alive for x in (root, a, *others))
+    check(tree)
+
+
+def test_a_second_cheaper_entry_moves_everything_behind_a_transition() -> None:
+    tree = a_tree()
+    root = tree.add_root(BEFORE, (0, 0), 0)
+    detour, _ = tree.insert(root, (5, 5))
+    first = tree.insert_transition(detour, PICK, AFTER, 1, 0.5)
+    inside, _ = tree.insert(first, (1, 1))
+    short, _ = tree.insert(root, (1, 1))
+    second = tree.insert_transition(short, PICK, AFTER, None, 0.5)
+    assert second is inside, "the same vertices in the same mode are the same node"
+    assert short.cost < detour.cost + tree.step_cost(first.at, inside.at)
+    assert inside.parent is short and inside.transition is PICK and inside.cost == pytest.approx(short.cost + 0.5)
+    tree.refute([(short, inside)])
+    assert inside.parent is first and inside.transition is None
     check(tree)
 
 

@@ -118,6 +118,8 @@ class Report:
 
     def __str__(self) -> str:
         if self.ok:
-            clearance = f"clearance {self.min_clearance_m * 1e3:.1f} mm"
+            clearance = (
+                f"clearance {self.min_clearance_m * 1e3:.1f} mm" if self.min_clearance_m < np.inf else "all far apart"
+            )
             return f"ok: {self.samples} configurations in {self.elapsed:.3f} s, {clearance}"
         return "\n".join([f"{len(self.violations)} violations", *(f"  {v}" for v in self.violations)])

@@ -18,6 +18,7 @@ from mrtamp.validity import Resting
 
 _MARGIN = 0.02
 """Clearance (m) of bounding spheres above which nothing can touch: padding, and what spheres miss of rotation."""
+_FIRST = 24
 _CURVE = 1.1
 """How much longer than its chord a point's way may be."""
 
@@ -25,8 +26,8 @@ _CURVE = 1.1
 class Track:
     """Motion of one robot with what it holds over M knots, its bounding spheres at the knots and their travel.
 
-    `held` is what the robot holds in each of the M - 1 steps, `finer` how many times as densely each is sampled where the
-    world is close.
+    `held` is what the robot holds in each of the M - 1 steps, `finer` how many times as densely each is sampled
+    against the world.
     """
 
     def __init__(self, roadmap: Roadmap, q: np.ndarray, held: Sequence[Attachment | None]) -> None:
@@ -42,6 +43,14 @@ class Track:
         travel = np.linalg.norm(np.diff(self.centres, axis=0), axis=2).max(axis=1, initial=0.0)
         points = np.concatenate([axes, self.hand[:, None]], axis=1)
         self.travel = np.maximum(travel, np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1))
+
+    def part(self, i: int, j: int, held: Sequence[Attachment | None]) -> Track:
+        """The track from knot i to knot j, with what is held there."""
+        out = Track.__new__(Track)
+        out.roadmap, out.radii, out.held = self.roadmap, self.radii, held
+        out.q, out.centres, out.hand = self.q[i : j + 1], self.centres[i : j + 1], self.hand[i : j + 1]
+        out.travel, out.finer = self.travel[i:j], self.finer[i:j]
+        return out
 
     def at(self, k: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Configurations (N, n) a share t of step k on."""
@@ -84,6 +93,11 @@ def samples(steps: np.ndarray, pieces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return k, t
 
 
+def _parts(index: np.ndarray) -> list[np.ndarray]:
+    """A few first, then the rest: most of what collides does so soon."""
+    return [part for part in np.split(index, [min(_FIRST, len(index))]) if len(part)]
+
+
 class Clearance:
     """Asks Drake about steps of tracks; remembers nothing."""
 
@@ -107,10 +121,11 @@ class Clearance:
         pair, swapped = self.collision.pair(a.roadmap.name, b.roadmap.name)
         for held_a, held_b in dict.fromkeys((a.held[s], b.held[s]) for s in steps.tolist()):
             mine = np.array([a.held[s] is held_a and b.held[s] is held_b for s in k.tolist()])
-            first, second = (a.at(k[mine], t[mine]), held_a), (b.at(k[mine], t[mine]), held_b)
-            hit = pair.first_hit(*second, *first) if swapped else pair.first_hit(*first, *second)
-            if hit >= 0:
-                return int(k[mine][hit])
+            for part in _parts(np.flatnonzero(mine)):
+                first, second = (a.at(k[part], t[part]), held_a), (b.at(k[part], t[part]), held_b)
+                hit = pair.first_hit(*second, *first) if swapped else pair.first_hit(*first, *second)
+                if hit >= 0:
+                    return int(k[part][hit])
         return -1
 
     def world(self, a: Track, steps: np.ndarray, resting: Sequence[Sequence[Resting]], static: bool) -> int:
@@ -134,7 +149,8 @@ class Clearance:
             order = self.rng.permutation(len(k))
             k, t = k[order], t[order]
             poses: Mapping[str, np.ndarray] = {x.name: x.X_WO for x in objects}
-            hit = world.first_hit(world.rows(a.at(k, t), held, poses))
-            if hit >= 0:
-                return int(k[hit])
+            for part in _parts(np.arange(len(k))):
+                hit = world.first_hit(world.rows(a.at(k[part], t[part]), held, poses))
+                if hit >= 0:
+                    return int(k[part][hit])
         return -1

@@ -101,8 +101,8 @@ def _model_path(reference: str, directory: Path, package_paths: tuple[Path, ...]
 class ModelFacts:
     """What a parsed model consists of.
 
-    `joints` maps each joint with one degree of freedom to its lower and upper limits; a `rigid` model is a single free
-    body, or several welded to each other.
+    `joints` maps each joint with one degree of freedom to its lower and upper limits; `prismatic` are those that slide.
+    A `rigid` model is a single free body, or several welded to each other.
     """
 
     reference: str
@@ -111,6 +111,7 @@ class ModelFacts:
     rigid: bool
     lower: np.ndarray | None
     upper: np.ndarray | None
+    prismatic: frozenset[str] = frozenset()
 
     def bounding_box(self) -> tuple[np.ndarray, np.ndarray]:
         """Corners (3,), (3,) of the box around all collision geometry, in the frame of the model's base body."""
@@ -175,6 +176,7 @@ def _parse(reference: str, file: str, package_paths: tuple[Path, ...], stamp: in
         rigid,
         None if points is None else points.min(axis=1),
         None if points is None else points.max(axis=1),
+        frozenset(joint.name() for joint in moving if joint.type_name() == "prismatic"),
     )
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from mrtamp.collision import RESOLUTION, Collision
 from mrtamp.incumbent import Incumbent
+from mrtamp.optimise import Optimiser
 from mrtamp.plan import Plan
 from mrtamp.problem import Problem
 from mrtamp.refine import Refiner
@@ -16,35 +17,52 @@ from mrtamp.roadmap import Roadmap
 from mrtamp.transitions.sampler import TransitionSampler
 from mrtamp.validity import Validity
 
-SIZE = 4
-_SLICE = 60
+SIZE = 6
+_SLICE = 40
 """Proposals of shortening per turn."""
-_SHORTENING = 480
-"""Proposals after which shortening ends at the latest."""
+_SHORTENING = 160
+"""Proposals after which shortening gives way to convex programming."""
+_ALONE = 1200
+"""The same where there is no convex programming."""
 _STALE = 0.004
 """Relative gain of a turn below which shortening has done its part."""
-WORTH_CHECKING = 0.003
+_TRIAL = 5
+"""Conic programs that a plan gets before it is compared with the others."""
+_HOPELESS = 1.3
+"""Plans that cost so many times the incumbent after their trial wait until nothing else is left to do."""
+_ROUNDS = 3
+"""Times that a finished plan is shaken and refined again without gain before it is left alone."""
+WORTH_CHECKING = 0.002
 """Relative gain over the incumbent that is worth a check."""
 
 
 @dataclass(eq=False)
 class _Entry:
-    """A checked plan and what works on it."""
+    """A checked plan and what works on it: shortening first, then convex programming."""
 
     plan: Plan
     resolution: float = RESOLUTION
     refiner: Refiner | None = None
+    optimiser: Optimiser | None = None
     proposals: int = 0
     done: bool = False
-    costs: list[float] = field(default_factory=list)
+    fruitless: int = 0
+    """Rounds without gain."""
+    before: float = np.inf
+    """Cost when this round began."""
 
     @property
     def cost(self) -> float:
-        return self.refiner.cost if self.refiner is not None else self.plan.cost
+        work = self.optimiser or self.refiner
+        return work.cost if work is not None else self.plan.cost
+
+    @property
+    def on_trial(self) -> bool:
+        return not self.done and (self.optimiser is None or self.optimiser.steps < _TRIAL)
 
 
 class Portfolio:
-    """Up to SIZE plans that take turns: the newest are shortened first, then the cheapest is optimised on."""
+    """Up to SIZE plans that take turns: the newest get a trial, then the cheapest goes on until it has converged."""
 
     def __init__(
         self,
@@ -79,29 +97,96 @@ class Portfolio:
 
     def improve(self, incumbent: float) -> Plan | None:
         """Give one plan its turn; a checked plan when it is clearly cheaper than `incumbent`."""
-        if not self._entries:
+        entry = self._choose(incumbent)
+        if entry is None:
             return None
-        entry = self._choose()
+        if entry.optimiser is None:
+            return self._shorten(entry, incumbent)
+        entry.optimiser.step()
+        plan = self._offer(entry, incumbent, entry.optimiser)
+        if entry.optimiser.converged:
+            self._finish(entry)
+        return plan
+
+    def _choose(self, incumbent: float) -> _Entry | None:
+        """Plans on trial first, the newest before the others; then the cheapest that goes on; then one to be shaken."""
+        trial = [e for e in self._entries if e.on_trial]
+        if trial:
+            return trial[-1]
+        going = [e for e in self._entries if not e.done and e.cost < _HOPELESS * incumbent]
+        if going:
+            return min(going, key=lambda e: e.cost)
+        waiting = [e for e in self._entries if not e.done]
+        rested = [e for e in self._entries if e.done and e.fruitless < _ROUNDS and e.cost < _HOPELESS * incumbent]
+        if rested:
+            entry = min(rested, key=lambda e: e.cost * (1 + 0.02 * e.fruitless))
+            entry.refiner, entry.optimiser, entry.proposals, entry.done = None, None, 0, False
+            return entry
+        return min(waiting, key=lambda e: e.cost, default=None)
+
+    def _shorten(self, entry: _Entry, incumbent: float) -> Plan | None:
         if entry.refiner is None:
             entry.refiner = self._refiner(entry)
+            entry.before = entry.plan.cost
         gain = entry.refiner.improve(_SLICE)
         entry.proposals += _SLICE
-        if entry.proposals >= _SHORTENING and gain < _STALE * entry.cost:
-            entry.done = True
-        if entry.refiner.cost > incumbent * (1 - WORTH_CHECKING):
-            return None
+        plan = self._offer(entry, incumbent, entry.refiner)
+        if entry.refiner is None:
+            return plan
+        enough = entry.proposals >= (_SHORTENING if self.convex else _ALONE)
+        if enough or (entry.proposals > 2 * _SLICE and gain < _STALE * entry.cost):
+            if self.convex:
+                self._begin_convex(entry)
+            elif enough:
+                self._finish(entry)
+        return plan
+
+    def _begin_convex(self, entry: _Entry) -> None:
+        """Go on from the shortened plan, if the judge agrees with it, else from the plan it was made from."""
+        assert entry.refiner is not None
         plan = self.incumbent.accepted(entry.refiner.segments(), entry.refiner.transitions)
         if plan is not None:
             entry.plan = plan
-            return plan
-        # Something slipped between the samples: go back to what was checked and look more closely.
-        entry.resolution /= 2
+        else:
+            entry.resolution /= 2
         entry.refiner = None
-        return None
+        entry.optimiser = Optimiser(
+            self.problem,
+            self.collision,
+            entry.plan.segments,
+            entry.plan.transitions,
+            self.sampler.families,
+            slide=self.sliding,
+        )
 
-    def _choose(self) -> _Entry:
-        fresh = [e for e in self._entries if not e.done]
-        return fresh[-1] if fresh else min(self._entries, key=lambda e: e.cost)
+    def _finish(self, entry: _Entry) -> None:
+        """Convergence: what was gained decides whether the plan is worth another round."""
+        if entry.optimiser is not None and entry.optimiser.cost < entry.plan.cost - 1e-9:
+            plan = self.incumbent.accepted(entry.optimiser.segments(), entry.optimiser.transitions)
+            if plan is not None:
+                entry.plan = plan
+        gained = entry.before - entry.plan.cost > WORTH_CHECKING * entry.plan.cost
+        entry.fruitless = 0 if gained else entry.fruitless + 1
+        entry.done, entry.refiner, entry.optimiser = True, None, None
+
+    def _offer(self, entry: _Entry, incumbent: float, work: Refiner | Optimiser) -> Plan | None:
+        """Have a plan checked that is clearly cheaper than the incumbent; where the judge objects, look closer."""
+        if work.cost > incumbent * (1 - WORTH_CHECKING):
+            return None
+        plan = self.incumbent.plan(work.segments(), work.transitions)
+        report = self.incumbent.judge(plan)
+        if report.ok:
+            entry.plan = plan
+            if isinstance(work, Optimiser):
+                work.confirm()
+            return plan
+        if isinstance(work, Optimiser):
+            work.tighten(report)
+        else:
+            # Something slipped between the samples: go back to what was checked.
+            entry.resolution /= 2
+            entry.refiner = None
+        return None
 
     def _refiner(self, entry: _Entry) -> Refiner:
         return Refiner(

@@ -31,13 +31,15 @@ _MERGED = 0.12
 _LONGEST = 40
 _CONTACT = 0.015
 """How far (m) the hand moves in the straight motions next to a change of attachment that stay as they are."""
-_NEAR, _FINER = 0.1, 8
+_NEAR, _FINER = 0.07, 8
 """Within this distance (m) of such a change the hand's motion is sampled so many times as densely."""
 _STRAIGHT = 1e-6
 _SLICES = 20
-_RETIMED = 0.25
-"""Share of proposals that are re-timings; of these, share that is searched on a grid."""
-_SEARCHED = 0.5
+_FLOOR = 0.08
+"""Least share of every kind of proposal; the rest goes by what each has gained for its collision checks."""
+_PROPOSAL = 30.0
+"""What a proposal costs beside its checks, in checks."""
+_FADE = 0.99
 _CELLS = 1500
 _DETOURS = 5
 _EPS = 1e-9
@@ -97,6 +99,9 @@ class Refiner:
         self.clearance = Clearance(collision, resolution, rng)
         self.names = list(segments[0].q)
         self.proposals = 0
+        self._counts = collision.counts
+        self._gain = np.array([0.6, 0.2, 0.2])
+        self._work = np.full(3, 10 * _PROPOSAL)
         self._after = {s.name: s.after for s in collision.problem.subgoals}
         self._start = segments[0].mode
         self._load(segments, transitions)
@@ -164,6 +169,7 @@ class Refiner:
         self._events = [h.at(int(starts[h.knot])) for h in self._events]
 
     def _measure(self) -> None:
+        self._tracks: dict[str, Track] = {}
         self._lengths = np.array([np.linalg.norm(np.diff(self._q[r], axis=0), axis=1) for r in self.names])
         changes = sum(self.weights.transitions.get(h.action.kind, 0.0) for h in self._events)
         self.cost = self._price(self._lengths) + changes
@@ -272,12 +278,22 @@ class Refiner:
         before = self.cost
         for _ in range(proposals):
             self.proposals += 1
-            if len(self.names) > 1 and self.rng.random() < _RETIMED:
-                self._retime()
-            else:
-                self._shortcut()
+            kind = int(self.rng.choice(len(self._gain), p=self._shares()))
+            cost, checks = self.cost, self._counts.collision_checks
+            self._shortcut() if kind == 0 else self._retime(search=kind == 2)
+            self._gain *= _FADE
+            self._work *= _FADE
+            self._gain[kind] += cost - self.cost
+            self._work[kind] += _PROPOSAL + self._counts.collision_checks - checks
         self._compress()
         return before - self.cost
+
+    def _shares(self) -> np.ndarray:
+        """How often to propose a shortcut, a simple re-timing and a searched one: as they have paid."""
+        if len(self.names) == 1:
+            return np.array([1.0, 0.0, 0.0])
+        rate = (self._gain + 1e-9) / self._work
+        return _FLOOR + (1 - 3 * _FLOOR) * rate / rate.sum()
 
     def _shortcut(self) -> None:
         index = int(self.rng.integers(len(self.names)))
@@ -302,6 +318,7 @@ class Refiner:
         if self._price(lengths) >= old - 1e-6 or not self._is_free(robot, i, fresh):
             return
         q[i : j + 1] = fresh
+        self._tracks.pop(robot, None)
         self._lengths[index, i:j] = own
         self.cost += self._price(lengths) - old
 
@@ -362,12 +379,20 @@ class Refiner:
         gap = np.linalg.norm(track.hand[:, None] - places, axis=2).min(axis=1)
         return np.where(np.minimum(gap[:-1], gap[1:]) < _NEAR, _FINER, 1)
 
+    def _present(self, robot: str, i: int, j: int, modes: Sequence[Mode]) -> Track:
+        """The present motion of a robot from knot i to knot j; kept until it changes."""
+        q = self._q[robot]
+        known = self._tracks.get(robot)
+        if known is None:
+            known = self._tracks[robot] = Track(self.roadmaps[robot], q, [])
+        return known.part(i, j, [m.held.get(robot) for m in modes])
+
     def _track(self, robot: str, q: np.ndarray, modes: Sequence[Mode]) -> Track:
         return Track(self.roadmaps[robot], q, [m.held.get(robot) for m in modes])
 
     # -- re-timing ------------------------------------------------------------------------------------------------
 
-    def _retime(self) -> None:
+    def _retime(self, search: bool) -> None:
         """Move one robot along its own path at another time, between two knots that stay."""
         index = int(self.rng.integers(len(self.names)))
         window = self._window(self.names[index])
@@ -387,7 +412,7 @@ class Refiner:
         present = float(self._lengths[:, i:j].max(axis=0).sum())
         if L <= _EPS or T <= _EPS or present - max(T, L) <= 1e-6:
             return
-        if self.rng.random() < _SEARCHED:
+        if search:
             self._search(plane, present)
         else:
             path = simple_timing(T, L, self.rng)

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
+from mrtamp.model_files import model_facts, resolve_model
 from mrtamp.modes import Attachment
 from mrtamp.plan import Action, Plan, measures
 from mrtamp.playback import Playback
+from mrtamp.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,19 @@ def timeline_text(plan: Plan, playback: Playback | None = None) -> str:
 def cost_text(plan: Plan) -> str:
     """One line: the cost and the two measures it is made of."""
     m = measures(plan.segments)
-    return f"cost {plan.cost:.3f}  (makespan {m['makespan']:.3f} rad, path length {m['path_length']:.3f} rad)"
+    unit = _joint_unit(plan.problem)
+    return f"cost {plan.cost:.3f}  (makespan {m['makespan']:.3f}{unit}, path length {m['path_length']:.3f}{unit})"
+
+
+def _joint_unit(problem: Problem) -> str:
+    """The unit of joint-space lengths: rad, m where all joints slide, none where robots have joints of both kinds."""
+    slides = set()
+    for robot in problem.robots:
+        model = robot.model
+        reference = resolve_model(model.model, model.file.parent if model.file else Path(), problem.package_paths)
+        facts = model_facts(reference, problem.package_paths)
+        slides |= {joint in facts.prismatic for joint in model.arm_joints}
+    return "" if len(slides) > 1 else " m" if True in slides else " rad"
 
 
 def history_text(plan: Plan, most: int = 12) -> str:

@@ -22,11 +22,11 @@ def planner(name: str, setting: Setting, seed: int = 0) -> IntraOrbitPlanner:
 
 
 def crossing(robots: int) -> tuple[Setting, At, At]:
-    """Robots on a 4 x 3 grid (three robots: 3 x 3) that change sides past an obstacle and each other."""
-    columns = 4 if robots == 2 else 3
-    roadmaps = [grid(n, columns, 3, jitter=0.1, seed=seed) for seed, n in enumerate("abc"[:robots])]
+    """Robots on a 4 x 3 grid (three robots: 3 x 2) that change sides past an obstacle and each other."""
+    columns, rows = (4, 3) if robots == 2 else (3, 2)
+    roadmaps = [grid(n, columns, rows, jitter=0.1, seed=seed) for seed, n in enumerate("abc"[:robots])]
     world = Flatland(roadmaps, radius=0.25, obstacles=[((1.5, 1.0), 0.2)])
-    start, goal = ((4, 7), (7, 4)) if robots == 2 else ((0, 8, 6), (8, 0, 2))
+    start, goal = ((4, 7), (7, 4)) if robots == 2 else ((0, 5, 2), (5, 0, 3))
     return Setting(world, roadmaps, start), start, goal
 
 
@@ -38,16 +38,18 @@ def check_branch(setting: Setting, node: Node) -> None:
             assert u == v or v in g.neighbours(u)
 
 
-@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("robots", [2, 3])
-@pytest.mark.parametrize("seed", range(3))
-def test_robots_change_places_and_never_beat_the_optimum(name: str, robots: int, seed: int) -> None:
-    setting, start, goal = crossing(robots)
-    there = planner(name, setting, seed).drive(setting.root, dict(zip("abc", goal, strict=False)))
-    assert there is not None and there.at == goal
-    check_branch(setting, there)
-    optimum = nx.dijkstra_path_length(product_graph(setting.world, setting.roadmaps), start, goal)
-    assert optimum - 1e-9 <= there.cost <= 2 * optimum
+def test_robots_change_places_and_never_beat_the_optimum(robots: int) -> None:
+    optimum = None
+    for name in NAMES:
+        for seed in range(3):
+            setting, start, goal = crossing(robots)
+            there = planner(name, setting, seed).drive(setting.root, dict(zip("abc", goal, strict=False)))
+            assert there is not None and there.at == goal
+            check_branch(setting, there)
+            if optimum is None:
+                optimum = nx.dijkstra_path_length(product_graph(setting.world, setting.roadmaps), start, goal)
+            assert optimum - 1e-9 <= there.cost <= 1.5 * optimum
 
 
 @pytest.mark.parametrize("name", NAMES)

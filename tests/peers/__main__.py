@@ -38,12 +38,16 @@ class Run:
 
     def at(self, seconds: float) -> float:
         """The best cost after some time."""
-        return min([cost for t, cost in self.costs if t <= seconds], default=float("nan"))
+        return min([cost for t, cost in self.costs if t <= seconds], default=np.inf)
 
     def line(self, checkpoints: list[float]) -> str:
         """First time and cost, the costs at the checkpoints, and the verdict."""
         first = f"{self.costs[0][0]:6.2f} s / {self.costs[0][1]:7.3f}" if self.costs else " " * 18
-        return "  ".join([first, *(f"{t:g} s: {self.at(t):7.3f}" for t in checkpoints), self.verdict])
+        return "  ".join([first, *(f"{t:g} s: {_shown(self.at(t))}" for t in checkpoints), self.verdict])
+
+
+def _shown(cost: float) -> str:
+    return f"{cost:7.3f}" if np.isfinite(cost) else "      -"
 
 
 def run(peer: Peer, referee: Referee, folder: Path, seed: int, budget: float) -> Run:
@@ -115,7 +119,7 @@ def main() -> None:
         solved = [r for r in runs if r.costs]
         if solved:
             first = np.median([r.costs[0] for r in solved], axis=0)
-            middle = "  ".join(f"{t:g} s: {np.median([r.at(t) for r in solved]):7.3f}" for t in checkpoints)
+            middle = "  ".join(f"{t:g} s: {_shown(np.median([r.at(t) for r in runs]))}" for t in checkpoints)
             print(f"  median: {first[0]:6.2f} s / {first[1]:7.3f}  {middle}  ({len(solved)} of {len(runs)} solved)")
         for line in published(file.parent, peer.name):
             print(f"  {line}")

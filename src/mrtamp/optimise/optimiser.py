@@ -43,8 +43,9 @@ _MARGIN = 1.5e-3
 _STRICTER = 1e-3
 _TOUCHING = -3e-4
 """Clearance (m) asked of an object and what it is lifted off or put on."""
-_GOOD, _STALL = 0.01, 0.001
-_PATIENCE = 4
+_TRUE, _FALSE = 0.7, 0.25
+_STALL = 5e-4
+_PATIENCE = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +111,7 @@ class Optimiser:
         self.trust = TRUST
         self.converged = False
         self._stalls = 0
+        self._promise = 0.0
         self._extra: Demands = {}
         self._changes = sum(self.weights.transitions.get(a.kind, 0.0) for t in transitions for a in t.actions)
         self.choices = Choices(problem, [s.mode for s in segments], transitions, families if slide else {})
@@ -205,18 +207,20 @@ class Optimiser:
         if clean and candidate.cost < self._best.cost - 1e-9:
             gain = self._best.cost - candidate.cost
             self._best = candidate
-        self._pace((before - after) / max(before, 1e-9), gain)
+        self._pace(before, after, self._promise + self._changes)
         if candidate.line.lengths(candidate.q).max() > 1.4 * self.knot:
             self._resample()
         return gain
 
-    def _pace(self, progress: float, gain: float) -> None:
-        if progress > _GOOD:
-            self.trust = min(1.2 * self.trust, _LARGEST)
-        elif progress < _STALL:
-            self.trust *= 0.6
-        self._stalls = self._stalls + 1 if gain < _STALL * self._best.cost and progress < _STALL else 0
-        self.converged = self.trust < _SMALLEST or self._stalls > _PATIENCE
+    def _pace(self, before: float, after: float, promised: float) -> None:
+        """Adapt the trust region to how much of the promised gain came true."""
+        share = (before - after) / max(before - promised, 1e-9)
+        if share > _TRUE:
+            self.trust = min(1.3 * self.trust, _LARGEST)
+        elif share < _FALSE:
+            self.trust *= 0.5
+        self._stalls = self._stalls + 1 if before - promised < _STALL * before or share < _FALSE else 0
+        self.converged = self.trust < _SMALLEST or self._stalls >= _PATIENCE
 
     def _reject(self) -> float:
         self.trust *= 0.5
@@ -237,9 +241,10 @@ class Optimiser:
         rows = Linearised(
             sparse.csr_array(collisions.A @ whole), -collisions.gap, equal, F, g, lower, upper
         )
-        x = solve(self._reduction, now.q, self.weights, rows)
-        if x is None:
+        solved = solve(self._reduction, now.q, self.weights, rows)
+        if solved is None:
             return None
+        x, self._promise = solved
         q = now.q + (E @ x[:n]).reshape(now.q.shape)
         c = np.clip(now.arrangement.c + scale * x[n:], *self.choices.bounds) if count else now.arrangement.c
         assert q.size == size

@@ -17,8 +17,6 @@ PENALTY = 20.0
 _TINY = 1e-4
 """Share of the makespan's weight that shapes idle motion where path length has no weight."""
 _TOLERANCE = 1e-4
-import os
-_PROX=float(os.environ.get("PROX","0"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +102,8 @@ class Linearised:
     upper: np.ndarray
 
 
-def solve(reduction: Reduction, q: np.ndarray, weights: CostWeights, rows: Linearised) -> np.ndarray | None:
-    """Minimise the linearised cost; returns x = (z, y), or None where Clarabel finds no optimum.
+def solve(reduction: Reduction, q: np.ndarray, weights: CostWeights, rows: Linearised) -> tuple[np.ndarray, float] | None:
+    """Minimise the linearised cost; returns x = (z, y) and its cost, or None where Clarabel finds no optimum.
 
     `q` (K, N) are the knots; x are changes of them and of the scaled coordinates.
     """
@@ -142,10 +140,6 @@ def solve(reduction: Reduction, q: np.ndarray, weights: CostWeights, rows: Linea
         b[1:] = dq[k, cols]
         program.AddLorentzConeConstraint(A, b, np.append(x[used], x[length + row]))
         low[length + row], high[length + row] = 0.0, np.inf
-    if _PROX:
-        w = program.NewContinuousVariables(1)
-        program.AddLinearCost(np.array([_PROX * (long + short)]), w)
-        program.AddLorentzConeConstraint(np.append(w, x[:n]))
     if long > 0:
         each = np.arange(robots * steps)
         entries = (np.concatenate([np.ones(len(each)), -np.ones(len(each))]),
@@ -166,4 +160,6 @@ def solve(reduction: Reduction, q: np.ndarray, weights: CostWeights, rows: Linea
     for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas"):
         options.SetOption(ClarabelSolver.id(), name, _TOLERANCE)
     result = ClarabelSolver().Solve(program, None, options)
-    return np.clip(result.GetSolution(x[:n]), rows.lower, rows.upper) if result.is_success() else None
+    if not result.is_success():
+        return None
+    return np.clip(result.GetSolution(x[:n]), rows.lower, rows.upper), float(result.get_optimal_cost())
