@@ -115,7 +115,9 @@ class Clearance:
         steps = steps[near_steps(a, b)[steps]]
         if not len(steps):
             return -1
-        k, t = samples(steps, self.pieces(np.maximum(a.travel, b.travel)[steps]))
+        # Two that move towards each other close in faster than either moves.
+        travel = np.maximum(np.maximum(a.travel, b.travel), 0.75 * (a.travel + b.travel))
+        k, t = samples(steps, self.pieces(travel[steps]))
         order = self.rng.permutation(len(k))
         k, t = k[order], t[order]
         pair, swapped = self.collision.pair(a.roadmap.name, b.roadmap.name)

@@ -6,7 +6,7 @@ tree is repaired where the judge refuted it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,12 +14,14 @@ import numpy as np
 from mrtamp.check import Report
 from mrtamp.check_report import Violation
 from mrtamp.graphs import Graphs
+from mrtamp.insertion import Insertion
 from mrtamp.intra_orbit.orbits import Orbits
 from mrtamp.intra_orbit.planners import INTRA_ORBIT
 from mrtamp.modes import Mode, goal_mode
-from mrtamp.plan import Transition, without_detours
+from mrtamp.plan import Segment, Transition, without_detours
 from mrtamp.problem import MrtampError, Problem, RobotAt
 from mrtamp.roadmap import Roadmap
+from mrtamp.steering import Steering
 from mrtamp.tensor_tree import At, Node, TensorTree
 from mrtamp.transitions.candidate import Candidate
 from mrtamp.validity import Validity
@@ -27,6 +29,9 @@ from mrtamp.validity import Validity
 if TYPE_CHECKING:
     from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
 
+Timed = tuple[list[Segment], list[Transition]]
+"""Motions and the transitions between them."""
+_SAME = 1e-9
 Combination = tuple[Candidate, ...]
 """Elementary transitions of disjoint robots that happen at the same instant."""
 
@@ -59,6 +64,8 @@ class Growth:
         graphs = list(roadmaps.values())
         self.orbits = Orbits(self.tree, self.graphs, graphs, validity)
         self.motion = INTRA_ORBIT[intra_orbit](graphs, validity, self._insert, rng, problem.cost)
+        self.steering = Steering(graphs, validity, self._insert, rng)
+        self.insertion = Insertion(roadmaps, validity.collision, validity, self.steering, rng)
         self.goal_vertices: dict[str, int] = {}
         self.goal_nodes: list[Node] = []
         self._banned: set[tuple] = set()
@@ -120,6 +127,58 @@ class Growth:
                 return None
             node = after
         return self.towards_goal(node) if self.is_goal_mode(node.mode) else None
+
+    def insert(self, proposal: Proposal, skeletons: SkeletonGuidance, root: Node) -> Timed | None:
+        """Realise a skeleton in space and time, motions of all robots inserted among each other; None if that fails.
+
+        The stop at which it ends is reported to the guidance.
+        """
+        stops = [stop for stop, _ in proposal.stops]
+        start = dict(zip(self.names, root.at, strict=True))
+        timed = self.insertion.realise(
+            root.mode,
+            start,
+            [s.robots for s in stops],
+            proposal.before,
+            lambda k, mode: skeletons.candidate(stops[k], mode),
+            self.goal_vertices,
+        )
+        if timed is None:
+            assert self.insertion.stuck is not None
+            skeletons.failed(proposal.stops[self.insertion.stuck][1])
+            return None
+        return timed if self.is_goal_mode(timed[0][-1].mode) else None
+
+    def adopt(self, segments: Sequence[Segment], transitions: Sequence[Transition], root: Node) -> Node:
+        """Put a checked plan into the roadmaps and the tree, so that the search builds on it; its last node.
+
+        Every knot becomes a vertex of its robots' roadmaps, every transition a contact that candidates may use.
+        """
+        node = root
+        for k, segment in enumerate(segments):
+            for i in range(1, segment.length):
+                node = self._insert(node, self._vertices(node, {r: q[i] for r, q in segment.q.items()}))
+            if k < len(transitions):
+                cost = sum(self.problem.cost.transitions.get(a.kind, 0.0) for a in transitions[k].actions)
+                node = self.orbits.enter(node, transitions[k], segments[k + 1].mode, cost)
+        if self._is_goal(node) and node not in self.goal_nodes:
+            self.goal_nodes.append(node)
+        return node
+
+    def _vertices(self, node: Node, q: Mapping[str, np.ndarray]) -> At:
+        """The vertices of a composite configuration, made where there are none."""
+        at = []
+        for name, here in zip(self.names, node.at, strict=True):
+            roadmap = self.roadmaps[name]
+            if np.array_equal(roadmap.q[here], q[name]):
+                at.append(here)
+                continue
+            goal = self.goal_vertices.get(name)
+            if goal is not None and np.abs(roadmap.q[goal] - q[name]).max() < _SAME:
+                at.append(goal)
+                continue
+            at.append(roadmap.add_vertex(q[name]))
+        return tuple(at)
 
     def without_detours(self, root: Node, solution: Node) -> None:
         """Extend the tree by a solution without the picks that were put back where they came from."""

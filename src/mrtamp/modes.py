@@ -184,4 +184,5 @@ def condition_holds(
 
 def goal_mode(problem: Problem, mode: Mode, X_WP: Mapping[str, np.ndarray]) -> bool:
     """Whether every subgoal is reached and every object condition of the goal holds."""
-    return len(mode.done) == len(problem.subgoals) and all(condition_holds(problem, c, mode, X_WP) for c in problem.goal if not isinstance(c, RobotAt))
+    conditions = [c for c in problem.goal if not isinstance(c, RobotAt)]
+    return len(mode.done) == len(problem.subgoals) and all(condition_holds(problem, c, mode, X_WP) for c in conditions)

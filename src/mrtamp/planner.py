@@ -427,11 +427,34 @@ class Planner:
             proposal: Proposal | None = next(self.skeletons.propose(_HOPE * self._cost()), None)
             if proposal is None:
                 return False
+            timed = self.growth.insert(proposal, self.skeletons, self.root)
+            plan = None if timed is None else self.incumbent.accepted(*timed)
+            if plan is not None:
+                self.skeletons.realised(proposal)
+                return self._adopt(plan)
             node = self.growth.realise(proposal, self.skeletons, self.root)
             if node is not None:
                 self.skeletons.realised(proposal)
                 return self._solution(node)
         return False
+
+    def _adopt(self, plan: Plan) -> bool:
+        """A checked plan that the tree does not have yet: into the tree, and under refinement."""
+        better = self.incumbent.offer(plan, self._elapsed())
+        if self._uses("adoption"):
+            node = self.growth.adopt(plan.segments, plan.transitions, self.root)
+            self._tree_cost = min(self._tree_cost, node.cost)
+            if better:
+                self._path = list(dict.fromkeys(x.orbit for x in self.tree.branch(node)))
+        self._found(plan)
+        return better
+
+    def _found(self, plan: Plan) -> None:
+        """There is a new plan: it is refined, and from now on the tree is rewired."""
+        if self._uses("refinement"):
+            self.portfolio.add(plan)
+        if self._uses("rewiring"):
+            self.growth.orbits.rewirings = _REWIRINGS
 
     # -- solutions ------------------------------------------------------------------------------------------------
 
@@ -471,12 +494,9 @@ class Planner:
                     self.tree.cut(node)
                 return False
         better = self.incumbent.offer(plan, self._elapsed())
-        if self._uses("rewiring"):
-            self.growth.orbits.rewirings = _REWIRINGS
         if better:
             self._path = [g[0].orbit for g in groups]
-        if self._uses("refinement"):
-            self.portfolio.add(plan)
+        self._found(plan)
         return better
 
     def _refine(self) -> bool:

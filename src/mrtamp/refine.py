@@ -499,25 +499,29 @@ class Refiner:
         changed = np.array(
             [not (same[k] and same[k + 1] and theirs[k] == own[k] and m is before[own[k]]) for k, m in enumerate(modes)]
         )
-        steps = np.flatnonzero(changed)
-        tracks = {r: self._track(r, q[r], modes) for r in self.names}
+        if not changed.any():
+            return -1
+        first, last = np.flatnonzero(changed)[[0, -1]]
+        steps = np.flatnonzero(changed[first : last + 1])
+        modes = modes[first : last + 1]
+        tracks = {robot: self._track(robot, q[robot][first : last + 2], modes)}
         for r in self.names:
             if r != robot:
+                tracks[r] = self._track(r, q[r][first : last + 2], modes)
                 hit = self.clearance.pair(tracks[robot], tracks[r], steps)
                 if hit >= 0:
-                    return hit
+                    return int(first) + hit
         # Each robot moves as before: only objects that did not rest there at that point of its path are new to it.
         for r in self.names:
-            old_step = own if r == robot else theirs
-            fresh: list[tuple[Resting, ...]] = []
-            for k, m in enumerate(modes):
-                known = {x.chain for x in self.validity.resting(before[old_step[k]])} if changed[k] else set()
-                fresh.append(tuple(x for x in self.validity.resting(m) if x.chain not in known) if changed[k] else ())
-            hit = self.clearance.world(
-                tracks[r], np.array([k for k in steps if fresh[k]], dtype=int), fresh, static=False
-            )
+            old = (own if r == robot else theirs)[first : last + 1]
+            fresh: list[tuple[Resting, ...]] = [()] * len(modes)
+            for k in steps.tolist():
+                known = {x.chain for x in self.validity.resting(before[old[k]])}
+                fresh[k] = tuple(x for x in self.validity.resting(modes[k]) if x.chain not in known)
+            some = np.array([k for k in steps.tolist() if fresh[k]], dtype=int)
+            hit = self.clearance.world(tracks[r], some, fresh, static=False)
             if hit >= 0:
-                return hit
+                return int(first) + hit
         return -1
 
     def _search(self, plane: _Plane, present: float) -> None:

@@ -110,8 +110,7 @@ class Grid:
 
     def __init__(self, cs: np.ndarray, ps: np.ndarray) -> None:
         self.cs, self.ps = cs, ps
-        self.blocked = np.zeros((len(cs), len(ps)), dtype=bool)
-        number = np.arange(self.blocked.size).reshape(self.blocked.shape)
+        number = np.arange(len(cs) * len(ps)).reshape(len(cs), len(ps))
         pairs = [(number[:-1], number[1:]), (number[:, :-1], number[:, 1:]), (number[:-1, :-1], number[1:, 1:])]
         self._from = np.concatenate([a.ravel() for a, _ in pairs])
         self._to = np.concatenate([b.ravel() for _, b in pairs])
@@ -122,10 +121,13 @@ class Grid:
 
     def forbid(self, c: float, p: float, robot_waits: bool) -> None:
         """The robot may not pass p before the others have come to c, or the others may not pass c before it did."""
-        if robot_waits:
-            self.blocked |= (self.cs < c - _EPS)[:, None] & (self.ps > p + _EPS)
-        else:
-            self.blocked |= (self.cs > c + _EPS)[:, None] & (self.ps < p - _EPS)
+        n = len(self.ps)
+        # With grid lines at c and p a move lies in the forbidden quarter if its middle does.
+        middle_c = (self.cs[self._from // n] + self.cs[self._to // n]) / 2
+        middle_p = (self.ps[self._from % n] + self.ps[self._to % n]) / 2
+        early, late = (middle_c, middle_p) if robot_waits else (middle_p, middle_c)
+        here, there = (c, p) if robot_waits else (p, c)
+        self._cost[(early < here - _EPS) & (late > there + _EPS)] = np.inf
 
     def block(self, a: np.ndarray, b: np.ndarray) -> None:
         """Take the moves out that overlap the leg from a to b, both (c, p)."""
@@ -133,19 +135,18 @@ class Grid:
         u, v = self._from, self._to
         inside = (self.cs[u // n] < b[0] + _EPS) & (self.cs[v // n] > a[0] - _EPS)
         inside &= (self.ps[u % n] < b[1] + _EPS) & (self.ps[v % n] > a[1] - _EPS)
-        self._cost = np.where(inside, np.inf, self._cost)
+        self._cost[inside] = np.inf
 
     def timing(self) -> np.ndarray | None:
         """The shortest timing (n, 2) that is not blocked, without needless corners."""
         n = len(self.ps)
-        blocked = self.blocked.ravel().copy()
-        blocked[[0, -1]] = False
-        use = np.isfinite(self._cost) & ~blocked[self._from] & ~blocked[self._to]
-        graph = csr_array((self._cost[use], (self._from[use], self._to[use])), shape=(blocked.size, blocked.size))
+        size = len(self.cs) * n
+        use = np.isfinite(self._cost)
+        graph = csr_array((self._cost[use], (self._from[use], self._to[use])), shape=(size, size))
         distance, parent = dijkstra(graph, indices=0, return_predecessors=True)
         if not np.isfinite(distance[-1]):
             return None
-        nodes = [blocked.size - 1]
+        nodes = [size - 1]
         while nodes[-1] != 0:
             nodes.append(int(parent[nodes[-1]]))
         index = np.array(nodes[::-1])

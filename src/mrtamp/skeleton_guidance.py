@@ -33,10 +33,14 @@ _MOST = 120
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A skeleton and its stops in the order in which they happen, with the ways they belong to."""
+    """A skeleton and its stops in the order in which they happen, with the ways they belong to.
+
+    `before` lists for every stop the numbers of those that must happen earlier.
+    """
 
     skeleton: Skeleton
     stops: tuple[tuple[Stop, Way], ...]
+    before: tuple[tuple[int, ...], ...]
 
 
 class SkeletonGuidance:
@@ -186,7 +190,16 @@ class SkeletonGuidance:
                 continue
             ways = {name: sets[name][o][m] for name, (o, m) in skeleton.choices.items()}
             stops = tuple((ways[h.task].stops[h.event], ways[h.task]) for h in skeleton.happenings)
-            yield Proposal(skeleton, stops)
+            yield Proposal(skeleton, stops, self._before(skeleton, sets))
+
+    def _before(self, skeleton: Skeleton, sets: Mapping[str, list[list[Way]]]) -> tuple[tuple[int, ...], ...]:
+        """What has to happen before every happening: the earlier events of its task, and what precedence says."""
+        number = {(h.task, h.event): k for k, h in enumerate(skeleton.happenings)}
+        count = {name: len(sets[name][o][m].stops) for name, (o, m) in skeleton.choices.items()}
+        before: list[list[int]] = [[number[h.task, h.event - 1]] if h.event else [] for h in skeleton.happenings]
+        for (a, i), (b, j) in self._precedence():
+            before[number[b, j % count[b]]].append(number[a, i % count[a]])
+        return tuple(tuple(x) for x in before)
 
     def update_bound(self) -> None:
         """Compute the least cost over all ways sampled so far."""

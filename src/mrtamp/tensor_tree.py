@@ -228,8 +228,8 @@ class TensorTree:
         self._remove(lost)
         return lost
 
-    def cut(self, node: Node) -> None:
-        """Remove a node with everything that hangs on it."""
+    def cut(self, node: Node) -> list[Node]:
+        """Remove a node with everything that hangs on it; returns what was removed."""
         if node.parent is not None:
             node.parent.children.remove(node)
             node.parent = None
@@ -239,6 +239,7 @@ class TensorTree:
             gone.append(x)
             stack += x.children
         self._remove(gone)
+        return gone
 
     def _remove(self, gone: list[Node]) -> None:
         for x in gone:

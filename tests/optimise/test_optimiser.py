@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from discs import Errands, disc_problem, errand
+from discs import HEIGHT, Errands, disc_problem, errand
 from gantry import Script, gantry_problem, valid_plan
+from pydrake.math import RigidTransform
 from test_rows import optimiser
 
 import mrtamp
@@ -16,7 +17,8 @@ from mrtamp.check import Checker
 from mrtamp.check_report import Report, Side, Violation
 from mrtamp.optimise import Optimiser
 from mrtamp.plan import Plan, plan_cost
-from mrtamp.problem import AtConfiguration, CostWeights, HandAt, HandIn, Problem, RobotAt, Subgoal
+from mrtamp.planner import Planner
+from mrtamp.problem import AtConfiguration, CostWeights, HandAt, HandIn, Problem, RobotAt, Shape, StaticBody, Subgoal
 
 
 def run(scp: Optimiser, steps: int = 40) -> list[float]:
@@ -84,8 +86,8 @@ def test_visits_keep_their_place_and_their_order(tmp_path: Path) -> None:
 
 def test_hands_slide_within_the_box_of_a_subgoal(tmp_path: Path) -> None:
     """The nearest point of the box is (-0.5, 0.1): from the start and back is 1.2."""
-    box = HandIn(mrtamp_pose(-0.4, 0.3), (0.4, 0.4, 0.2))
-    subgoals = (Subgoal("in", {"a": box}), Subgoal("at", {"b": HandAt(mrtamp_pose(0.5, 0.0))}))
+    box = HandIn(pose(-0.4, 0.3), (0.4, 0.4, 0.2))
+    subgoals = (Subgoal("in", {"a": box}), Subgoal("at", {"b": HandAt(pose(0.5, 0.0))}))
     problem = discs(tmp_path, subgoals=subgoals, goal=(RobotAt("a", np.array([-0.5, -0.5])),))
     e = Errands(problem).move(a=(-0.3, 0.4), b=(0.5, 0.0)).reach("in", "at").move(a=(-0.5, -0.5))
     scp = optimiser(e.plan())
@@ -94,31 +96,21 @@ def test_hands_slide_within_the_box_of_a_subgoal(tmp_path: Path) -> None:
     assert judged(scp).ok
 
 
-def mrtamp_pose(x: float, y: float):
-    from pydrake.math import RigidTransform
-
-    return RigidTransform([x, y, 0.06])
+def pose(x: float, y: float) -> RigidTransform:
+    return RigidTransform([x, y, HEIGHT])
 
 
 def test_a_disc_goes_around_a_wall_by_the_shortest_way(tmp_path: Path) -> None:
     """Around the corner of a wall at a distance of its radius: two tangents and an arc between them."""
-    from pydrake.math import RigidTransform
-
-    from mrtamp.problem import Shape, StaticBody
-
     wall = StaticBody("wall", RigidTransform([-1.0, 0, 0.05]), Shape("box", (2.0, 0.002, 0.1)))
     problem = discs(tmp_path, statics=(wall,), goal=(RobotAt("a", np.array([-0.5, 0.5])),))
     e = Errands(problem).move(a=(0.4, -0.5)).move(a=(0.4, 0.5)).move(a=(-0.5, 0.5))
     scp = optimiser(e.plan())
     run(scp)
-    r, d = 0.2, np.hypot(0.5, 0.499)
-    tangent = np.sqrt(d**2 - r**2)
-    arc = 2 * np.pi - 2 * np.arccos(r / d) - 2 * np.arctan2(0.499, 0.5) - np.pi
-    arc = max(2 * (np.pi - np.arctan2(0.499, -0.5) - 0) if False else arc, 0.0)
-    # By symmetry: the angle at the corner from the start's direction to the goal's on the open side, less the tangents'.
-    opening = 2 * np.pi - 2 * np.arctan2(0.499, 0.5)
-    optimum = 2 * tangent + r * (opening - 2 * np.arccos(r / d)) + 0.002
-    assert optimum * 1.01 * 0.999 <= scp.cost <= optimum * 1.01 * 1.004
+    # The wall's end is at (0, 0), start and goal are on either side of the wall, an angle of 270 degrees apart.
+    r, d = 0.2, np.hypot(0.5, 0.5)
+    optimum = 2 * np.sqrt(d**2 - r**2) + r * (1.5 * np.pi - 2 * np.arccos(r / d))
+    assert 0.999 * optimum <= scp.cost / 1.01 <= 1.004 * optimum
     assert judged(scp).ok
 
 
@@ -186,9 +178,7 @@ def test_a_confirmed_result_is_not_given_up(tmp_path: Path) -> None:
     assert judged(scp).ok
 
 
-def test_two_arms(tmp_path: Path) -> None:
-    from mrtamp.planner import Planner
-
+def test_two_arms() -> None:
     planner = Planner(mrtamp.load_problem("pick_place", robots=2, objects=2), seed=0)
     plan = next(planner.improve(30, first=True))
     scp = Optimiser(planner.problem, planner.collision, plan.segments, plan.transitions, planner.sampler.families)

@@ -44,14 +44,14 @@ class Orbits:
         self.roadmaps = list(roadmaps)
         self.validity = validity
         self.rewirings = rewirings
+        self._invalid: set[tuple[int, int]] = set()
 
     def insert(self, node: Node, at: At) -> tuple[Node, bool]:
         """InsertAndRewire: a validated step from `node` to `at`; returns (the node at its end, whether it is new)."""
-        known = self.tree.find(node.mode, at)
-        before = None if known is None else known.cost
         reached, new = self.tree.insert(node, at)
         self._join(node, reached)
-        if self.rewirings and (before is None or reached.cost < before - _EPS):
+        if self.rewirings:
+            # Known nodes too: what the bound left out last time, or has become worth it since, gets its turn.
             self.rewire(reached)
         return reached, new
 
@@ -71,7 +71,11 @@ class Orbits:
         A connection is validated only when it would lower a cost; returns the number of validations.
         """
         near, steps = self.tree.adjacent(node)
-        unproved = [(x, float(c)) for x, c in zip(near, steps, strict=True) if x not in node.steps]
+        unproved = [
+            (x, float(c))
+            for x, c in zip(near, steps, strict=True)
+            if x not in node.steps and (min(x.index, node.index), max(x.index, node.index)) not in self._invalid
+        ]
         left = self.rewirings
         for x, step in sorted(unproved, key=lambda item: (item[0].cost + item[1], item[0].index)):
             if not left or x.cost + step >= node.cost - _EPS:
@@ -90,6 +94,7 @@ class Orbits:
 
     def _connect(self, a: Node, b: Node) -> bool:
         if not step_is_valid(self.roadmaps, self.validity, a.mode, a.at, b.at):
+            self._invalid.add((min(a.index, b.index), max(a.index, b.index)))
             return False
         self.tree.connect(a, b)
         self._join(a, b)
@@ -127,6 +132,11 @@ class Orbits:
     def refute_entries(self, node: Node) -> None:
         """The change of mode that leads to `node` is invalid at its vertices: withdraw every transition to it."""
         self._withdraw([(x, node) for x in node.entries])
+
+    def remove(self, node: Node) -> None:
+        """Remove a node, with everything that hangs on it, for a reason that no single step is to blame for."""
+        gone = self.tree.cut(node)
+        self._split({x.orbit: None for x in gone})
 
     def _withdraw(self, pairs: Sequence[tuple[Node, Node]]) -> None:
         lost = self.tree.refute(pairs)

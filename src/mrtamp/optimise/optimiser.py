@@ -29,6 +29,7 @@ from mrtamp.transitions.families import GraspFamily
 Demands = dict[Who, dict[tuple[int, float, int], int]]
 """Who -> (step, fraction, segment) -> by how many millimetres more they shall be clear there."""
 
+LEVELS = 1
 TRUST = 0.2
 """First radius (rad) of the trust region of every joint."""
 _LARGEST, _SMALLEST = 0.4, 0.01
@@ -39,7 +40,7 @@ _SHALLOW = 1e-3
 _NEAR = 0.06
 """Distance (m) below which pairs of solids enter the program."""
 _MARGIN = 1.5e-3
-"""Clearance (m) that the program asks for at its samples."""
+"""Clearance (m) that the program asks for at its samples; a third of it at every finer level."""
 _STRICTER = 1e-3
 _TOUCHING = -3e-4
 """Clearance (m) asked of an object and what it is lifted off or put on."""
@@ -80,6 +81,7 @@ class Optimiser:
     segments, transitions : a valid plan.
     families : (robot, object) -> grasp families within which grasps may slide.
     knot : length (rad) of the steps of the polyline.
+    levels : how often steps beside bends are halved, each time the one before has converged.
     slide : whether transitions may slide along their strata; otherwise their configurations stay as they are.
 
     Attributes
@@ -98,6 +100,7 @@ class Optimiser:
         families: Mapping[tuple[str, str], Sequence[GraspFamily]],
         *,
         knot: float = 0.27,
+        levels: int = LEVELS,
         slide: bool = True,
     ) -> None:
         self.problem = problem
@@ -106,6 +109,8 @@ class Optimiser:
         self.nearness = Nearness(collision)
         self.fine = FineCheck(self.nearness)
         self.knot = knot
+        self.levels = levels
+        self._level = 0
         self.slide = slide
         self.steps = 0
         self.trust = TRUST
@@ -148,8 +153,7 @@ class Optimiser:
         """The judge refused the best iterate: ask for more clearance where it collided, and go on from there."""
         refused = self._best
         self._best, self.converged, self._stalls = self._sure, False, 0
-        self._now, self._collisions = refused, None
-        self._adopt(refused.line)
+        self._return_to(refused)
         bounds = [0, *refused.line.events.tolist()]
         for violation in report.violations:
             who = self._guilty(violation, refused.arrangement)
@@ -173,8 +177,18 @@ class Optimiser:
         self.slide = False
         self.choices = self._sure.arrangement.frozen()
         self._extra.clear()
-        self._now = self._iterate(self._sure.line, self._sure.q, self.choices.at(self.choices.start))
+        self._sure = self._iterate(self._sure.line, self._sure.q, self.choices.at(self.choices.start))
+        self._best = self._now = self._sure
+        self._collisions = None
         self._adopt(self._now.line)
+
+    def _return_to(self, iterate: Iterate) -> None:
+        """Go on from an earlier iterate."""
+        if iterate.line is not self._now.line:
+            # What violations taught is about steps of the other polyline.
+            self._extra.clear()
+        self._now, self._collisions = iterate, None
+        self._adopt(iterate.line)
 
     # -- one step ---------------------------------------------------------------------------------------------------
 
@@ -208,7 +222,7 @@ class Optimiser:
             gain = self._best.cost - candidate.cost
             self._best = candidate
         self._pace(before, after, self._promise + self._changes)
-        if candidate.line.lengths(candidate.q).max() > 1.4 * self.knot:
+        if self._now is candidate and candidate.line.lengths(candidate.q).max() > 1.4 * self.knot:
             self._resample()
         return gain
 
@@ -220,11 +234,22 @@ class Optimiser:
         elif share < _FALSE:
             self.trust *= 0.5
         self._stalls = self._stalls + 1 if before - promised < _STALL * before or share < _FALSE else 0
-        self.converged = self.trust < _SMALLEST or self._stalls >= _PATIENCE
+        self._settle(self.trust < _SMALLEST or self._stalls >= _PATIENCE)
+
+    def _settle(self, done: bool) -> None:
+        """Where the polyline has converged, go on with finer steps beside its bends."""
+        if done and self._level < self.levels:
+            self._level += 1
+            self._stalls, self.trust = 0, TRUST / 2**self._level
+            self._return_to(self._best)
+            self._extra.clear()
+            self._resample()
+        else:
+            self.converged = done
 
     def _reject(self) -> float:
         self.trust *= 0.5
-        self.converged = self.trust < _SMALLEST
+        self._settle(self.trust < _SMALLEST)
         return 0.0
 
     def _merit(self, x: Iterate, collisions: _Collisions) -> float:
@@ -311,12 +336,13 @@ class Optimiser:
 
     def _samples(self, base: Samples, extra: Mapping[tuple[int, float, int], int]) -> tuple[Samples, np.ndarray]:
         """The samples of a query and the clearance (S,) asked for at each."""
-        least = _MARGIN - 0.25 * self.problem.collision.tolerance
+        finer = 3.0**-self._level
+        least = _MARGIN * finer - 0.25 * self.problem.collision.tolerance
         margin = np.full(len(base), least)
         if not extra:
             return base, margin
         lo, t, segment = (np.array(x) for x in zip(*extra, strict=True))
-        strict = least + _STRICTER * np.array(list(extra.values()))
+        strict = least + _STRICTER * finer * np.array(list(extra.values()))
         return base.joined(Samples(lo, t, segment)), np.concatenate([margin, strict])
 
     def _linearise(self, at: Iterate, base: Samples, demands: Demands) -> _Collisions:
@@ -406,7 +432,7 @@ class Optimiser:
         """Spread the knots of the current iterate evenly again."""
         now = self._now
         line = Polyline(now.line.columns, now.q, now.line.events, now.line.stretches)
-        u = line.resampled(self.knot)
+        u = line.resampled(self.knot, self._level)
         fresh = line.at(u)
         moved: Demands = {}
         for who, rows in self._extra.items():

@@ -101,33 +101,51 @@ class Polyline:
         stretches = tuple(s.shifted(index) for s in self.stretches)
         return Polyline(self.columns, q, index[self.events], stretches)
 
-    def resampled(self, knot: float) -> np.ndarray:
-        """Parameters u of a polyline of steps of at most `knot` (rad), and not much less where that costs no detail."""
+    def resampled(self, knot: float, level: int = 0) -> np.ndarray:
+        """Parameters u of a polyline of steps of at most `knot` (rad), and not much less where that costs no detail.
+
+        At higher levels steps beside bends are shorter, by a factor of two per level.
+        """
         anchors = {0, self.knots - 1, *self.events.tolist()}
         for s in self.stretches:
             anchors |= {s.far, s.near}
+        deviation = _DEVIATION / 4**level
         along = np.concatenate([[0.0], np.cumsum(self.lengths().max(axis=0))])
         out: list[float] = [0.0]
         i = 0
         while i < self.knots - 1:
             j = i + 1
-            while j not in anchors and self._straight(i, j + 1):
+            while j not in anchors and self._straight(i, j + 1, deviation):
                 j += 1
             pieces = max(1, int(np.ceil(self._span(i, j) / knot - 1e-9)))
             inner = along[i] + (along[j] - along[i]) * np.arange(1, pieces) / pieces
             out += [*np.interp(inner, along[i : j + 1], np.arange(i, j + 1)).tolist(), float(j)]
             i = j
-        return np.array(out)
+        u = np.array(out)
+        return u if level == 0 else self._finer(u, knot / 2**level, deviation / 2)
+
+    def _finer(self, u: np.ndarray, knot: float, deviation: float) -> np.ndarray:
+        """Parameters with steps of at most `knot` on both sides of every bend."""
+        q = self.at(u).q
+        bend = np.zeros(len(u), dtype=bool)
+        for k in range(1, len(u) - 1):
+            whole = q[k + 1] - q[k - 1]
+            t = np.clip((q[k] - q[k - 1]) @ whole / max(float(whole @ whole), 1e-300), 0.0, 1.0)
+            bend[k] = np.abs(q[k] - q[k - 1] - t * whole).max() > deviation
+        length = np.max([np.linalg.norm(np.diff(q[:, c], axis=0), axis=1) for c in self.columns.values()], axis=0)
+        pieces = np.where(bend[:-1] | bend[1:], np.maximum(np.ceil(length / knot - 1e-9), 1), 1).astype(int)
+        inner = [a + (b - a) * np.arange(n) / n for a, b, n in zip(u[:-1], u[1:], pieces, strict=True)]
+        return np.concatenate([*inner, u[-1:]])
 
     def _span(self, i: int, j: int) -> float:
         return max(float(np.linalg.norm(self.q[j, c] - self.q[i, c])) for c in self.columns.values())
 
-    def _straight(self, i: int, j: int) -> bool:
+    def _straight(self, i: int, j: int, deviation: float) -> bool:
         """Whether the chord from knot i to knot j stands for all between them."""
         whole = self.q[j] - self.q[i]
         inner = self.q[i + 1 : j] - self.q[i]
         t = np.clip(inner @ whole / max(float(whole @ whole), 1e-300), 0.0, 1.0)
-        return bool(np.abs(inner - t[:, None] * whole).max() <= _DEVIATION)
+        return bool(np.abs(inner - t[:, None] * whole).max() <= deviation)
 
 
 def load(segments: Sequence[Segment], transitions: Sequence[Transition], tools: Mapping[str, Tool]) -> Polyline:

@@ -1,0 +1,243 @@
+"""Realising a skeleton in space and time: one robot's motion after the other is inserted among those already timed.
+
+Every leg is the shortest roadmap path of its robot past static and resting things; the timing, and if need be the
+other robots' stepping aside, keeps robots apart.  Idle and finished robots may always move (DESIGN section 9).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrtamp.collision import Collision
+from mrtamp.modes import Mode
+from mrtamp.plan import Segment, Transition
+from mrtamp.roadmap import Roadmap
+from mrtamp.space_time import STEP, Clearances, Leg, SpaceTime
+from mrtamp.steering import Steering
+from mrtamp.transitions.candidate import Candidate
+from mrtamp.validity import Validity
+
+_DEPTH = 2
+"""How many robots may have to move for one another in a chain."""
+_ASIDE = 6
+"""Random vertices offered to a robot that is in the way."""
+
+
+Stand = Callable[[int, Mode], Candidate | None]
+"""Number of a stop, mode -> its transition there; None while something is in its way."""
+
+
+@dataclass(eq=False)
+class _State:
+    """A schedule so far, the roadmap vertex where each robot stands at its end, and the stops still to come."""
+
+    time: SpaceTime
+    at: dict[str, int]
+    mode: Mode
+    pending: tuple[int, ...]
+    transitions: tuple[Transition, ...] = ()
+
+    def copy(self) -> _State:
+        return _State(self.time.copy(), dict(self.at), self.mode, self.pending, self.transitions)
+
+
+class Insertion:
+    """Builds timed plans for skeletons whose stops stand on roadmap vertices.
+
+    Each robot's stops keep their order; among robots, the stop that can happen soonest happens next, and only where
+    none can, robots step aside for one another.
+
+    Attributes
+    ----------
+    stuck : number of a stop that could not be reached when the last attempt failed; None if it did not.
+    """
+
+    def __init__(
+        self,
+        roadmaps: Mapping[str, Roadmap],
+        collision: Collision,
+        validity: Validity,
+        steering: Steering,
+        rng: np.random.Generator,
+    ) -> None:
+        self.roadmaps = roadmaps
+        self.names = list(roadmaps)
+        self.validity = validity
+        self.steering = steering
+        self.rng = rng
+        self.stuck: int | None = None
+        self._clearances = Clearances(collision, validity, self.names)
+        self._rows: dict[tuple[str, int], int] = {}
+        self._edges: dict[tuple[str, int, int], list[int]] = {}
+        self._known: dict[tuple[int, Mode], Candidate | None] = {}
+
+    def realise(
+        self,
+        root: Mode,
+        start: Mapping[str, int],
+        robots: Sequence[Sequence[str]],
+        before: Sequence[Sequence[int]],
+        stand: Stand,
+        goal: Mapping[str, int],
+    ) -> tuple[list[Segment], list[Transition]] | None:
+        """Motions that bring about the stops and end at the goal vertices, or None.
+
+        Parameters
+        ----------
+        start, goal : robot -> vertex; robots without a goal end anywhere.
+        robots : who takes part in every stop, in an order of stops that is possible for every robot.
+        before : numbers of the stops that have to happen earlier than each.
+        stand : transitions at the stops.
+        """
+        self.stuck = None
+        self._known.clear()
+        q = {r: self.roadmaps[r].q[v] for r, v in start.items()}
+        time = SpaceTime(self._clearances, q, [root])
+        state = _State(time, dict(start), root, tuple(range(len(robots))))
+        while state.pending:
+            ready = self._ready(state, robots, before)
+            targets = self._targets(state, robots, stand, goal)
+            after = None
+            for depth in range(_DEPTH + 1):
+                tried = [self._happen(state, k, stand, targets, depth) for k in ready]
+                done = [x for x in tried if x is not None]
+                if done:
+                    after = min(done, key=lambda x: x.time.events[-1])
+                    break
+            if after is None:
+                self.stuck = ready[0] if ready else state.pending[0]
+                return None
+            state = after
+        home = self._go_home(state, goal)
+        if home is None:
+            self.stuck = len(robots) - 1
+            return None
+        return home.time.segments(), list(state.transitions)
+
+    @staticmethod
+    def _ready(state: _State, robots: Sequence[Sequence[str]], before: Sequence[Sequence[int]]) -> list[int]:
+        """Stops that are next for all their robots and wait for nothing."""
+        busy: set[str] = set()
+        out = []
+        for k in state.pending:
+            if not busy & set(robots[k]) and not set(before[k]) & set(state.pending):
+                out.append(k)
+            busy |= set(robots[k])
+        return out
+
+    def _targets(
+        self, state: _State, robots: Sequence[Sequence[str]], stand: Stand, goal: Mapping[str, int]
+    ) -> dict[str, int]:
+        """Where each robot goes next, as far as that stands on a roadmap already."""
+        out = dict(goal)
+        for k in reversed(state.pending):
+            for r in robots[k]:
+                candidate = self._known.get((k, state.mode))
+                out.pop(r, None)
+                if candidate is not None:
+                    out[r] = candidate.at[r]
+        return out
+
+    def _happen(self, state: _State, k: int, stand: Stand, targets: Mapping[str, int], depth: int) -> _State | None:
+        """The schedule in which stop k happens next, or None."""
+        if (k, state.mode) not in self._known:
+            self._known[k, state.mode] = stand(k, state.mode)
+        candidate = self._known[k, state.mode]
+        if candidate is None:
+            return None
+        trial: _State | None = state
+        for robot, v in candidate.at.items():
+            trial = self._bring(trial, robot, v, targets, depth) if trial is not None else None
+        if trial is None or any(trial.at[r] != v for r, v in candidate.at.items()):
+            return None
+        transition = Transition((candidate.action,))
+        trial = trial.copy()
+        trial.mode = state.mode.after(transition)
+        trial.time.modes.append(trial.mode)
+        if not all(self.validity.edge(r, self.roadmaps[r].edge(v, v), trial.mode) for r, v in candidate.at.items()):
+            return None
+        if not trial.time.happen(transition.active):
+            return None
+        trial.pending = tuple(x for x in state.pending if x != k)
+        trial.transitions = (*state.transitions, transition)
+        return trial
+
+    def _go_home(self, state: _State, goal: Mapping[str, int]) -> _State | None:
+        for order in itertools.islice(itertools.permutations(goal), 6):
+            trial: _State | None = state
+            for robot in order:
+                trial = self._bring(trial, robot, goal[robot], goal, _DEPTH) if trial is not None else None
+            # Who had to step aside for others comes back.
+            for robot in order:
+                trial = self._bring(trial, robot, goal[robot], goal, 0) if trial is not None else None
+            if trial is not None:
+                return trial
+        return None
+
+    def _bring(self, state: _State, robot: str, v: int, targets: Mapping[str, int], depth: int) -> _State | None:
+        """The schedule with a leg to vertex v inserted, others moved out of the way first where they stand in it."""
+        if state.at[robot] == v:
+            return state
+        leg = self._leg(state, robot, v)
+        if leg is None:
+            return None
+        trial = state.copy()
+        if trial.time.insert(leg):
+            trial.at[robot] = v
+            return trial
+        if depth == 0:
+            return None
+        for other in state.time.in_the_way(leg):
+            for w in self._ways_out(state, other, targets):
+                if not self._clears(state, other, w, leg):
+                    continue
+                moved = self._bring(state, other, w, targets, depth - 1)
+                done = self._bring(moved, robot, v, targets, depth - 1) if moved is not None else None
+                if done is not None:
+                    return done
+        return None
+
+    def _ways_out(self, state: _State, robot: str, targets: Mapping[str, int]) -> list[int]:
+        """Vertices a robot may go to: its next stop, the start, back from where it stands, anywhere."""
+        roadmap = self.roadmaps[robot]
+        vertices = roadmap.open_vertices()
+        random = [vertices[i] for i in self.rng.integers(len(vertices), size=_ASIDE)]
+        here = state.at[robot]
+        onward = [targets[robot]] if robot in targets else []
+        return [v for v in dict.fromkeys([*onward, 0, *roadmap.exits.get(here, [])[::-1], *random]) if v != here]
+
+    def _clears(self, state: _State, robot: str, v: int, leg: Leg) -> bool:
+        """Whether a robot that stands at v leaves the leg of another free."""
+        trial = state.time.copy()
+        trial.at[robot] = self._row(robot, v)
+        return robot not in trial.in_the_way(leg)
+
+    def _leg(self, state: _State, robot: str, v: int) -> Leg | None:
+        at = tuple(state.at[r] for r in self.names)
+        others = {r for r in self.names if r != robot}
+        path, _ = self.steering.path(state.mode, at, robot, v, ignore=others)
+        if path is None:
+            return None
+        rows = [state.time.at[robot]]
+        for a, b in itertools.pairwise(path):
+            rows += self._edge(robot, a, b)
+        self._clearances.prepare(robot, [*itertools.pairwise(rows), *zip(rows, rows, strict=True)])
+        return Leg({robot: rows}, state.mode)
+
+    def _row(self, robot: str, v: int) -> int:
+        if (robot, v) not in self._rows:
+            self._rows[robot, v] = self._clearances.row(robot, self.roadmaps[robot].q[v].copy())
+        return self._rows[robot, v]
+
+    def _edge(self, robot: str, a: int, b: int) -> list[int]:
+        """Rows along an edge from a to b, the first end excluded."""
+        if (robot, a, b) not in self._edges:
+            q = self.roadmaps[robot].q
+            n = max(1, int(np.ceil(np.linalg.norm(q[b] - q[a]) / STEP)))
+            inner = [self._clearances.row(robot, q[a] + (q[b] - q[a]) * (j / n)) for j in range(1, n)]
+            self._edges[robot, a, b] = [*inner, self._row(robot, b)]
+        return self._edges[robot, a, b]

@@ -1,0 +1,358 @@
+"""Motions of several robots in space and time: timed moves along given paths, inserted one after another.
+
+One step of time is one move of every robot, of at most `STEP`.  A leg is inserted at the earliest timing along its path
+that keeps clear of the others' timed moves, of their standing where they stopped, and of objects as they lie at that
+moment (DESIGN section 9, insertion).
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrtamp.collision import RESOLUTION, Collision, bisection_order
+from mrtamp.modes import Attachment, Mode
+from mrtamp.plan import Segment
+from mrtamp.validity import Validity
+
+STEP = 0.12
+"""Longest motion (rad or m) of a robot in one step of time."""
+_NEAR = 0.012
+"""Clearance (m) of bounding spheres below which Drake is asked."""
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """Robots that move together through rows of their tables; `path` maps each to (m + 1) row numbers."""
+
+    path: Mapping[str, list[int]]
+    mode: Mode
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        return tuple(self.path)
+
+    @property
+    def length(self) -> int:
+        return len(next(iter(self.path.values()))) - 1
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """What one robot does in one step: from row `a` to row `b` of its table; free among objects as in `mode`."""
+
+    a: int
+    b: int
+    mode: Mode | None
+
+
+class Clearances:
+    """Cached answers: pairs of moving robots, and robots against objects that were elsewhere when they were checked."""
+
+    def __init__(self, collision: Collision, validity: Validity, names: Sequence[str]) -> None:
+        self.collision = collision
+        self.validity = validity
+        self.worlds = {r: collision.worlds[r] for r in names}
+        self.tables: dict[str, list[np.ndarray]] = {r: [] for r in names}
+        self._pairs: dict[tuple, bool] = {}
+        self._objects: dict[tuple, bool] = {}
+        self._sampled: dict[tuple[str, int, int], tuple[np.ndarray, np.ndarray, np.ndarray, float]] = {}
+        self._balls: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
+
+    def row(self, robot: str, q: np.ndarray) -> int:
+        """Put a configuration into a robot's table."""
+        self.tables[robot].append(q)
+        return len(self.tables[robot]) - 1
+
+    def prepare(self, robot: str, moves: Sequence[tuple[int, int]]) -> None:
+        """Sample moves (pairs of rows) at their ends and middles, all at once: bodies, hand and displacement."""
+        world = self.worlds[robot]
+        table = self.tables[robot]
+        fresh = [m for m in dict.fromkeys(moves) if (robot, *m) not in self._sampled]
+        if not fresh:
+            return
+        q = np.array([[table[a], (table[a] + table[b]) / 2, table[b]] for a, b in fresh])
+        flat = q.reshape(-1, q.shape[2])
+        centres = world.bounds.spheres(flat).reshape(len(fresh), 3, -1, 3)
+        R, p = world.tool.pose(flat)
+        R, p = R.reshape(-1, 3, 3, 3), p.reshape(-1, 3, 3)
+        tracked = np.concatenate([centres, p[:, :, None]], axis=2)
+        travel = 2.2 * np.linalg.norm(np.diff(tracked, axis=1), axis=3).max(axis=(1, 2))
+        for k, (i, j) in enumerate(fresh):
+            self._sampled[robot, i, j] = (centres[k], R[k], p[k], float(travel[k]))
+
+    def _sample(self, robot: str, a: int, b: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        if (robot, a, b) not in self._sampled:
+            self.prepare(robot, [(a, b)])
+        return self._sampled[robot, a, b]
+
+    def _ball(self, robot: str, a: int, b: int, held: Attachment | None) -> tuple[np.ndarray, np.ndarray]:
+        """Balls (B, 3), (B,) that hold every body, and the load, all through a move."""
+        key = (robot, a, b, held)
+        if key not in self._balls:
+            world = self.worlds[robot]
+            centres, R, p, _ = self._sample(robot, a, b)
+            radii = world.bounds.radii
+            if held is not None:
+                centres = np.concatenate([centres, (p + R @ held.X_PO[:3, 3])[:, None]], axis=1)
+                radii = np.append(radii, world.object_radius[held.object])
+            middle = (centres.min(axis=0) + centres.max(axis=0)) / 2
+            self._balls[key] = (middle, radii + np.linalg.norm(centres - middle, axis=2).max(axis=0))
+        return self._balls[key]
+
+    def _samples(self, robots: Sequence[tuple[str, Move]]) -> int:
+        """How many samples of a step keep every tracked point within the resolution from one to the next."""
+        travel = max(self._sample(robot, move.a, move.b)[3] for robot, move in robots)
+        return max(2, int(np.ceil(travel / RESOLUTION)) + 1)
+
+    def apart(
+        self, one: str, a: Move, held_a: Attachment | None, two: str, b: Move, held_b: Attachment | None
+    ) -> bool:
+        """Whether two robots keep clear of each other in one step."""
+        if one > two:
+            one, a, held_a, two, b, held_b = two, b, held_b, one, a, held_a
+        key = (one, a.a, a.b, held_a, two, b.a, b.b, held_b)
+        known = self._pairs.get(key)
+        if known is None:
+            known = self._pairs[key] = self._apart(one, a, held_a, two, b, held_b)
+        return known
+
+    def _apart(
+        self, one: str, a: Move, held_a: Attachment | None, two: str, b: Move, held_b: Attachment | None
+    ) -> bool:
+        ca, ra = self._ball(one, a.a, a.b, held_a)
+        cb, rb = self._ball(two, b.a, b.b, held_b)
+        gap = np.linalg.norm(ca[:, None] - cb[None], axis=2) - ra[:, None] - rb[None]
+        if gap.min() > _NEAR:
+            return True
+        n = self._samples([(one, a), (two, b)]) if (a.a, b.a) != (a.b, b.b) else 1
+        t = np.linspace(0, 1, n)[bisection_order(n)][:, None]
+        qa = (1 - t) * self.tables[one][a.a] + t * self.tables[one][a.b]
+        qb = (1 - t) * self.tables[two][b.a] + t * self.tables[two][b.b]
+        pair, swapped = self.collision.pair(one, two)
+        first, second = ((qb, held_b), (qa, held_a)) if swapped else ((qa, held_a), (qb, held_b))
+        return pair.first_hit(*first, *second, exact=(t[:, 0] == 0) | (t[:, 0] == 1)) < 0
+
+    def among(self, robot: str, move: Move, held: Attachment | None, mode: Mode) -> bool:
+        """Whether a move keeps clear of the objects that rest in `mode` but not in the mode it was checked in."""
+        if move.mode is mode:
+            return True
+        known = {r.chain for r in self.validity.resting(move.mode)} if move.mode is not None else set()
+        return all(
+            self._misses(robot, move, held, r.name, r.chain, r.X_WO)
+            for r in self.validity.resting(mode)
+            if r.chain not in known
+        )
+
+    def _misses(
+        self, robot: str, move: Move, held: Attachment | None, item: str, chain: tuple, X_WO: np.ndarray
+    ) -> bool:
+        if held is not None and held.object == item:
+            return True
+        key = (robot, move.a, move.b, held, chain)
+        known = self._objects.get(key)
+        if known is None:
+            centres, radii = self._ball(robot, move.a, move.b, held)
+            world = self.worlds[robot]
+            gap = np.linalg.norm(centres - X_WO[:3, 3], axis=1) - radii - world.object_radius[item]
+            known = bool(gap.min() > _NEAR)
+            if not known:
+                n = self._samples([(robot, move)]) if move.a != move.b else 1
+                t = np.linspace(0, 1, n)[:, None]
+                q = (1 - t) * self.tables[robot][move.a] + t * self.tables[robot][move.b]
+                known = world.first_hit(world.rows(q, held, {item: X_WO})) < 0
+            self._objects[key] = known
+        return known
+
+
+class SpaceTime:
+    """Timed moves of all robots, grown leg by leg and event by event; one step is one unit of time."""
+
+    def __init__(self, clearance: Clearances, start: Mapping[str, np.ndarray], modes: Sequence[Mode]) -> None:
+        self.clearance = clearance
+        self.modes = list(modes)
+        self.names = list(start)
+        self.moves: dict[str, list[Move]] = {r: [] for r in self.names}
+        self.held: dict[str, list[Attachment | None]] = {r: [] for r in self.names}
+        self.at: dict[str, int] = {r: clearance.row(r, q) for r, q in start.items()}
+        self._stands_in: dict[str, Mode] = dict.fromkeys(self.names, self.modes[0])
+        self.free_from = dict.fromkeys(self.names, 0)
+        self.events: list[int] = []
+
+    def copy(self) -> SpaceTime:
+        """A schedule to try things on; tables and answers are shared."""
+        other = object.__new__(SpaceTime)
+        other.clearance, other.names = self.clearance, self.names
+        other.modes, other.events = list(self.modes), list(self.events)
+        other.moves = {r: list(x) for r, x in self.moves.items()}
+        other.held = {r: list(x) for r, x in self.held.items()}
+        other.at, other.free_from = dict(self.at), dict(self.free_from)
+        other._stands_in = dict(self._stands_in)
+        return other
+
+    @property
+    def end(self) -> int:
+        """When everything scheduled so far is over."""
+        return max([*self.free_from.values(), *self.events[-1:]])
+
+    def _mode(self, t: int) -> Mode:
+        """The mode of the step from t to t + 1."""
+        return self.modes[sum(e <= t for e in self.events)]
+
+    def _move(self, robot: str, t: int) -> Move:
+        moves = self.moves[robot]
+        return moves[t] if t < len(moves) else self.standing(robot)
+
+    def standing(self, robot: str) -> Move:
+        """A robot's waiting where its last leg ended."""
+        return Move(self.at[robot], self.at[robot], self._stands_in[robot])
+
+    def _holds(self, robot: str, t: int) -> Attachment | None:
+        held = self.held[robot]
+        return held[t] if t < len(held) else self._mode(t).held.get(robot)
+
+    def _clear(self, robot: str, move: Move, held: Attachment | None, t: int, others: Sequence[str]) -> bool:
+        return self.clearance.among(robot, move, held, self._mode(t)) and all(
+            self.clearance.apart(robot, move, held, o, self._move(o, t), self._holds(o, t)) for o in others
+        )
+
+    def insert(self, leg: Leg, *, certain: bool = False) -> bool:
+        """Schedule a leg as early as it can end; False if that is never.
+
+        `certain`: it is known to be free once everything scheduled so far is over.
+        """
+        begin = max(self.free_from[r] for r in leg.robots)
+        times = self._earliest(leg, begin)
+        if times is None:
+            if not certain:
+                return False
+            times = [*([0] * (max(self.end, begin) - begin)), *range(leg.length + 1)]
+        for r in leg.robots:
+            self._wait(r, begin)
+            path = leg.path[r]
+            for i, j in itertools.pairwise(times):
+                self.moves[r].append(Move(path[i], path[j], leg.mode))
+                self.held[r].append(leg.mode.held.get(r))
+            self.at[r], self._stands_in[r] = path[-1], leg.mode
+            self.free_from[r] = begin + len(times) - 1
+        return True
+
+    def _wait(self, robot: str, until: int) -> None:
+        for t in range(len(self.moves[robot]), until):
+            self.held[robot].append(self._holds(robot, t))
+            self.moves[robot].append(self.standing(robot))
+
+    def _earliest(self, leg: Leg, begin: int) -> list[int] | None:
+        """Index along the leg at every instant from `begin` to its arrival: A* over (time, index), waiting allowed."""
+        m, last = leg.length, max(self.end, begin)
+        others = [r for r in self.names if r not in leg.path]
+        parent: dict[tuple[int, int], tuple[int, int] | None] = {(begin, 0): None}
+        queue: list[tuple[int, int, int]] = [(begin + m, 0, begin)]
+        while queue:
+            _, minus_i, t = heapq.heappop(queue)
+            i = -minus_i
+            if i == m and self._may_stay(leg, others, t, last):
+                times, back = [], parent[t, i]
+                while back is not None:
+                    times.append(back[1])
+                    back = parent[back]
+                return [*times[::-1], m]
+            for j in (i + 1, i) if i < m else (i,):
+                state = (t + 1, j)
+                # Once all others have come to rest there is nothing to wait for.
+                if state in parent or (j == i and t >= last) or not self._step(leg, others, i, j, t):
+                    continue
+                parent[state] = (t, i)
+                heapq.heappush(queue, (t + 1 + m - j, -j, t + 1))
+        return None
+
+    def _step(self, leg: Leg, others: Sequence[str], i: int, j: int, t: int) -> bool:
+        return all(
+            self._clear(r, Move(path[i], path[j], leg.mode), leg.mode.held.get(r), t, others)
+            for r, path in leg.path.items()
+        )
+
+    def _may_stay(self, leg: Leg, others: Sequence[str], t: int, last: int) -> bool:
+        m = leg.length
+        return all(self._step(leg, others, m, m, s) for s in range(t, last))
+
+    def in_the_way(self, leg: Leg) -> list[str]:
+        """Robots that block a leg from where they stand in the end."""
+        pairs = [(r, path) for r, path in leg.path.items()]
+        return [
+            o
+            for o in self.names
+            if o not in leg.path
+            and not all(
+                self.clearance.apart(
+                    r,
+                    Move(path[i], path[min(i + 1, leg.length)], leg.mode),
+                    leg.mode.held.get(r),
+                    o,
+                    self.standing(o),
+                    self._holds(o, self.end),
+                )
+                for r, path in pairs
+                for i in range(leg.length + 1)
+            )
+        ]
+
+    def happen(self, active: Sequence[str], *, certain: bool = False) -> bool:
+        """Schedule the next event as early as its robots are there and all motions bear the new mode; False if never.
+
+        `certain`: it is known to be possible once everything scheduled so far is over.
+        """
+        t = max([*self.events[-1:], *(self.free_from[r] for r in active)])
+        end = max(self.end, t)
+        while t <= end and not self._bears(active, t, end):
+            t += 1
+        if t > end:
+            if not certain:
+                return False
+            t = end
+        for r in active:
+            self._wait(r, t)
+        self.events.append(t)
+        for r in active:
+            self.free_from[r] = t
+            self._stands_in[r] = self.modes[len(self.events)]
+        return True
+
+    def _bears(self, active: Sequence[str], t: int, end: int) -> bool:
+        """Whether all that is scheduled from t to the end is free in the mode after an event at t."""
+        self.events.append(t)
+        try:
+            after = self.modes[len(self.events)]
+            for s in range(t, max(end, t + 1)):
+                moves = {r: self._move(r, s) for r in self.names}
+                for r in active:
+                    moves[r] = Move(moves[r].a, moves[r].b, after)
+                held = {r: after.held.get(r) if r in active else self._holds(r, s) for r in self.names}
+                for k, r in enumerate(self.names):
+                    if not self.clearance.among(r, moves[r], held[r], after):
+                        return False
+                    if not all(
+                        self.clearance.apart(r, moves[r], held[r], o, moves[o], held[o]) for o in self.names[k + 1 :]
+                    ):
+                        return False
+            return True
+        finally:
+            self.events.pop()
+
+    def segments(self) -> list[Segment]:
+        """The schedule as segments, one per mode."""
+        end = self.end
+        tables = self.clearance.tables
+        for r in self.names:
+            self._wait(r, end)
+        rows = {r: [*(m.a for m in self.moves[r][:end]), self.at[r]] for r in self.names}
+        q = {r: np.array([tables[r][i] for i in rows[r]]) for r in self.names}
+        bounds = [0, *self.events, end]
+        return [
+            Segment(mode, {r: q[r][a : b + 1].copy() for r in self.names})
+            for mode, a, b in zip(self.modes, bounds[:-1], bounds[1:], strict=True)
+        ]
