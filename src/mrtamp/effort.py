@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 _FORGET = 0.97
 """What is remembered of work and gains from one record to the next."""
@@ -12,16 +12,20 @@ class Effort:
     """Chooses the next activity so that each gets its share of the work.
 
     A share is the activity's floor plus a part of what the floors leave over, in proportion to the gain per work that
-    the activity has had of late; where nothing has gained, it is split evenly.
+    the activity has had of late; where nothing has gained, in proportion to `prior`.
 
     Parameters
     ----------
     floors : activity -> least share; their sum is at most 1.
+    prior : activity -> its part of the rest while nothing is known; adds up to 1.
     ceilings : activity -> largest share, 1 where missing; at least one activity has to be without.
     """
 
-    def __init__(self, floors: Mapping[str, float], ceilings: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self, floors: Mapping[str, float], prior: Mapping[str, float], ceilings: Mapping[str, float] | None = None
+    ) -> None:
         self.floors = dict(floors)
+        self._prior = dict(prior)
         self.ceilings = {name: (ceilings or {}).get(name, 1.0) for name in floors}
         self.total = dict.fromkeys(floors, 0.0)
         self._work = dict.fromkeys(floors, 1e-9)
@@ -33,7 +37,7 @@ class Effort:
         whole = sum(rates.values())
         spare = 1.0 - sum(self.floors.values())
         out = {
-            name: floor + spare * (rates[name] / whole if whole > 0 else 1.0 / len(rates))
+            name: floor + spare * (rates[name] / whole if whole > 0 else self._prior[name])
             for name, floor in self.floors.items()
         }
         excess = sum(max(0.0, share - self.ceilings[name]) for name, share in out.items())
@@ -43,11 +47,11 @@ class Effort:
             for name, share in out.items()
         }
 
-    def next(self) -> str:
-        """The activity that is furthest behind its share of the recent work."""
+    def next(self, available: Sequence[str]) -> str:
+        """The one of the available activities that is furthest behind its share of the recent work."""
         whole = sum(self._work.values())
         shares = self.shares()
-        return max(self.floors, key=lambda name: shares[name] * whole - self._work[name])
+        return max(available, key=lambda name: shares[name] * whole - self._work[name])
 
     def record(self, activity: str, work: float, gain: float) -> None:
         """Note what an activity took (s, or any other measure that is the same for all) and by how much cost fell."""

@@ -152,7 +152,9 @@ class Planner:
             sliding=self._uses("sliding"),
         )
         self._effort = Effort(
-            {"search": 0.05, "skeletons": 0.1, "refinement": 0.1}, {"refinement": self.options.refinement_share}
+            {"search": 0.05, "skeletons": 0.1, "refinement": 0.1},
+            {"search": 0.0, "skeletons": 0.15, "refinement": 0.85},
+            {"refinement": self.options.refinement_share},
         )
         self._timed = True
         self._spent = time.perf_counter() - self._clock
@@ -217,13 +219,12 @@ class Planner:
 
     def _next_activity(self) -> str:
         """Before the first plan search and skeletons in turn; then what is behind its share."""
-        refine, skeletons = self._uses("refinement"), self._uses("skeletons") and self.skeletons.applies
+        skeletons = self._uses("skeletons") and self.skeletons.applies
         if self.best is None:
             return "skeletons" if skeletons and self.iteration % _SKELETON_TURN == 0 else "search"
-        activity = self._effort.next()
-        if (activity == "refinement" and not refine) or (activity == "skeletons" and not skeletons):
-            return "search"
-        return activity
+        refine = self._uses("refinement") and not self.portfolio.idle(self._cost())
+        available = ["search", *(["skeletons"] if skeletons else []), *(["refinement"] if refine else [])]
+        return self._effort.next(available)
 
     def _uses(self, mechanism: str) -> bool:
         return mechanism not in self.options.without

@@ -108,6 +108,10 @@ class Portfolio:
             self._finish(entry)
         return plan
 
+    def idle(self, incumbent: float) -> bool:
+        """Whether no plan promises a gain any more."""
+        return all(e.done and (e.fruitless >= _ROUNDS or e.cost >= _HOPELESS * incumbent) for e in self._entries)
+
     def _choose(self, incumbent: float) -> _Entry | None:
         """Plans on trial first, the newest before the others; then the cheapest that goes on; then one to be shaken."""
         trial = [e for e in self._entries if e.on_trial]

@@ -31,14 +31,17 @@ _MERGED = 0.12
 _LONGEST = 40
 _CONTACT = 0.015
 """How far (m) the hand moves in the straight motions next to a change of attachment that stay as they are."""
-_NEAR, _FINER = 0.07, 8
+_NEAR, _FINER = 0.05, 5
 """Within this distance (m) of such a change the hand's motion is sampled so many times as densely."""
 _STRAIGHT = 1e-6
 _SLICES = 20
 _FLOOR = 0.08
-"""Least share of every kind of proposal; the rest goes by what each has gained for its collision checks."""
+"""Least share of the work for every kind of proposal; the rest goes by what each has gained for its work."""
 _PROPOSAL = 30.0
-"""What a proposal costs beside its checks, in checks."""
+_TRY = 200.0
+"""What a proposal, and the geometry of a re-timing, cost beside their checks, in checks."""
+_LEAST = 5e-5
+"""Gain, relative to the cost, below which a proposal is not worth its checks."""
 _FADE = 0.99
 _CELLS = 1500
 _DETOURS = 5
@@ -102,6 +105,8 @@ class Refiner:
         self._counts = collision.counts
         self._gain = np.array([0.6, 0.2, 0.2])
         self._work = np.full(3, 10 * _PROPOSAL)
+        self._spent = np.zeros(3)
+        self._tries = 0
         self._after = {s.name: s.after for s in collision.problem.subgoals}
         self._start = segments[0].mode
         self._load(segments, transitions)
@@ -278,20 +283,22 @@ class Refiner:
         before = self.cost
         for _ in range(proposals):
             self.proposals += 1
-            kind = int(self.rng.choice(len(self._gain), p=self._shares()))
-            cost, checks = self.cost, self._counts.collision_checks
+            kind = int(np.argmin(self._spent / self._shares()))
+            cost, checks, self._tries = self.cost, self._counts.collision_checks, 0
             self._shortcut() if kind == 0 else self._retime(search=kind == 2)
             self._gain *= _FADE
             self._work *= _FADE
             self._gain[kind] += cost - self.cost
-            self._work[kind] += _PROPOSAL + self._counts.collision_checks - checks
+            work = _PROPOSAL + _TRY * self._tries + self._counts.collision_checks - checks
+            self._work[kind] += work
+            self._spent[kind] += work
         self._compress()
         return before - self.cost
 
     def _shares(self) -> np.ndarray:
-        """How often to propose a shortcut, a simple re-timing and a searched one: as they have paid."""
+        """Shares of the work for shortcuts, simple re-timings and searched ones: as they have paid."""
         if len(self.names) == 1:
-            return np.array([1.0, 0.0, 0.0])
+            return np.array([1.0, 1e-9, 1e-9])
         rate = (self._gain + 1e-9) / self._work
         return _FLOOR + (1 - 3 * _FLOOR) * rate / rate.sum()
 
@@ -315,7 +322,7 @@ class Refiner:
         lengths = self._lengths[:, i:j].copy()
         old = self._price(lengths)
         lengths[index] = own
-        if self._price(lengths) >= old - 1e-6 or not self._is_free(robot, i, fresh):
+        if self._price(lengths) >= old - _LEAST * self.cost or not self._is_free(robot, i, fresh):
             return
         q[i : j + 1] = fresh
         self._tracks.pop(robot, None)
@@ -410,14 +417,18 @@ class Refiner:
         )
         T, L = plane.clock[-1], plane.progress[-1]
         present = float(self._lengths[:, i:j].max(axis=0).sum())
-        if L <= _EPS or T <= _EPS or present - max(T, L) <= 1e-6:
+        if L <= _EPS or T <= _EPS or present - max(T, L) <= self._least():
             return
         if search:
             self._search(plane, present)
         else:
             path = simple_timing(T, L, self.rng)
-            if duration(path) < present - 1e-6:
+            if duration(path) < present - self._least():
                 self._try(plane, path)
+
+    def _least(self) -> float:
+        """Least gain in time (rad) that is worth a try."""
+        return _LEAST * self.cost / max(self.weights.makespan, _EPS)
 
     def _window(self, robot: str) -> tuple[int, int] | None:
         """Two knots between which no action needs the robot together with others."""
@@ -453,6 +464,7 @@ class Refiner:
         timing = self._cut(plane, path)
         if timing is None:
             return None
+        self._tries += 1
         i, j, M = plane.i, plane.j, len(timing.c)
         q = {}
         for n, r in enumerate(self.names):
@@ -542,7 +554,7 @@ class Refiner:
                     grid.forbid(c, p, robot_waits=own_b)
         for _ in range(_DETOURS):
             path = grid.timing()
-            if path is None or duration(path) >= present - 1e-6:
+            if path is None or duration(path) >= present - self._least():
                 return
             hit = self._try(plane, path)
             if hit is None:

@@ -13,6 +13,8 @@ from mrtamp.collision import Collision
 from mrtamp.kinematics import inverse, rotation_vectors
 from mrtamp.modes import object_poses
 from mrtamp.optimise import Optimiser
+from mrtamp.optimise.collisions import CollisionRows
+from mrtamp.optimise.fine import knot_samples
 from mrtamp.optimise.nearness import Near, Nearness
 from mrtamp.plan import Plan
 from mrtamp.transitions.families import grasp_families
@@ -28,6 +30,10 @@ def optimiser(plan: Plan, **keys: bool) -> Optimiser:
         for o in problem.objects
     }
     return Optimiser(problem, Collision(problem), plan.segments, plan.transitions, families, **keys)
+
+
+def rows(scp: Optimiser) -> CollisionRows:
+    return scp.collisions.rows(scp._now.line, scp._now.q, scp._now.arrangement)
 
 
 @pytest.fixture
@@ -52,7 +58,7 @@ def test_distance_rows_are_derivatives_of_drakes_distances(gantries: Optimiser) 
     rng = np.random.default_rng(0)
     now, nearness = gantries._now, gantries.nearness
     line = now.line
-    samples, _ = gantries._demands(line)
+    samples = knot_samples(line, np.full(line.knots - 1, 2))
     # Off the start: parallel faces have no unique witness points.
     q, c = turned(now, 0.03, rng)
     dq, dc = rng.normal(size=q.shape), 0.2 * rng.normal(size=c.shape)
@@ -67,7 +73,7 @@ def test_distance_rows_are_derivatives_of_drakes_distances(gantries: Optimiser) 
     for who in (("left",), ("right",), ("left", "right")):
         near = ask(0.0, who)
         knots = {r: q[:, line.columns[r]] for r in who}
-        A = gantries._gradient(line, samples, near, knots, gantries.choices.at(c))
+        A = gantries.collisions.gradient(line, samples, near, knots, gantries.choices.at(c))
         slopes = dict(
             zip(
                 zip(near.sample.tolist(), near.a.tolist(), near.b.tolist(), strict=True),
@@ -87,7 +93,7 @@ def test_distance_rows_are_derivatives_of_drakes_distances(gantries: Optimiser) 
 
 
 def test_rows_of_held_and_resting_objects_are_among_them(gantries: Optimiser) -> None:
-    collisions = gantries._linearise(gantries._now, *gantries._demands(gantries._now.line))
+    collisions = rows(gantries)
     coordinates = collisions.A[:, gantries._now.q.size :]
     assert (np.abs(coordinates).sum(axis=0) > 0).sum() >= 5
 
@@ -142,6 +148,6 @@ def test_projection_closes_what_the_linear_step_leaves_open(gantries: Optimiser)
 
 def test_prismatic_robots_without_gripper_have_rows_too(tmp_path: Path) -> None:
     discs = optimiser(errand(disc_problem(tmp_path)))
-    collisions = discs._linearise(discs._now, *discs._demands(discs._now.line))
+    collisions = rows(discs)
     assert collisions.A.shape[0] == len(collisions.gap)
     assert isinstance(discs.nearness, Nearness)

@@ -76,9 +76,9 @@ class Choices:
         self.X_WB = {WORLD: np.eye(4), **{s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}}
         fixed = set(modes[0].attachments)
         for t in transitions:
-            for a in t.actions:
-                if a.kind == "reach" and a.before is not None and a.after is not None:
-                    fixed |= {a.before, a.after}
+            for action in t.actions:
+                if action.kind == "reach" and action.before is not None and action.after is not None:
+                    fixed |= {action.before, action.after}
         self.slides: list[Slide] = []
         self.count = 0
         start: list[np.ndarray] = []

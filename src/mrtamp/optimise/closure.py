@@ -15,8 +15,8 @@ from mrtamp.collision import RobotWorld
 from mrtamp.kinematics import inverse, matrix
 from mrtamp.modes import Mode
 from mrtamp.optimise.choices import Arrangement
-from mrtamp.optimise.screws import cross, joint_screws, transported, upstream
 from mrtamp.optimise.polyline import Polyline, Stretch
+from mrtamp.optimise.screws import cross, joint_screws, transported, upstream
 from mrtamp.plan import Action
 from mrtamp.problem import HandAt, HandIn, Problem
 from mrtamp.transitions.projection import solve_ik
@@ -103,8 +103,8 @@ class Closure:
             knot = int(self.line.events[s.event])
             (X_WE, near), (X_WF, far) = hands[s.robot, knot], hands[s.robot, s.far]
             there = X_WF if s.hand == "lifting" else X_WE
-            moved = [-_at(near, X_WE[:3, 3]), _at(far, there[:3, 3])]
-            out.append(_rows([(self._knot(s.robot, knot), moved[0]), (self._knot(s.robot, s.far), moved[1])]))
+            one, two = -_at(near, X_WE[:3, 3]), _at(far, there[:3, 3])
+            out.append(_rows([(self._knot(s.robot, knot), one), (self._knot(s.robot, s.far), two)]))
         return out
 
     def _hands(self, q: np.ndarray) -> dict[tuple[str, int], tuple[np.ndarray, np.ndarray]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,8 +47,11 @@ class FineCheck:
         self.nearness = nearness
         self.resolution = resolution
 
-    def samples(self, line: Polyline, q: np.ndarray) -> Samples:
-        """Samples between which no tracked point of any robot moves further than the resolution, transitions twice."""
+    def samples(self, line: Polyline, q: np.ndarray, between: bool = False) -> Samples:
+        """Samples between which no tracked point of any robot moves further than the resolution, transitions twice.
+
+        With `between`, the samples in the middle of those.
+        """
         travel = np.zeros(line.knots - 1)
         for robot, columns in line.columns.items():
             world = self.nearness.worlds[robot]
@@ -59,11 +62,25 @@ class FineCheck:
             for points in (own, hand):
                 travel = np.maximum(travel, np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1))
         pieces = np.maximum(1, np.ceil(1.1 * travel / self.resolution)).astype(int)
-        return knot_samples(line, pieces)
+        if not between:
+            return knot_samples(line, pieces)
+        lo = np.repeat(np.arange(line.knots - 1), pieces)
+        t = np.concatenate([np.zeros(0), *((np.arange(n) + 0.5) / n for n in pieces.tolist())])
+        return Samples(lo, t, line.segment_of_step[lo])
 
-    def violations(self, line: Polyline, q: np.ndarray, arrangement: Arrangement) -> list[Violations]:
-        """All samples in collision; pairs of configurations that the problem or the transitions fix are not asked."""
-        samples = self.samples(line, q)
+    def violations(
+        self,
+        line: Polyline,
+        q: np.ndarray,
+        arrangement: Arrangement,
+        pinned: Mapping[str, np.ndarray],
+        between: bool = False,
+    ) -> list[Violations]:
+        """All samples in collision; with `between`, of the samples in the middle of the others.
+
+        Next to knots (K,) at which both of two robots are `pinned`, their shapes count without padding.
+        """
+        samples = self.samples(line, q, between)
         names = list(line.columns)
         x = {r: samples.at(q[:, line.columns[r]]) for r in names}
         spheres = {r: self.nearness.spheres(r, x[r], arrangement.modes, samples.segment) for r in names}
@@ -73,7 +90,8 @@ class FineCheck:
             if len(hits):
                 out.append(Violations((robot,), samples[hits]))
             for other in names[:i]:
-                hits = self._pair(other, robot, x, samples, arrangement, spheres)
+                tight = pinned[other] & pinned[robot]
+                hits = self._pair(other, robot, x, samples, arrangement, spheres, tight)
                 if len(hits):
                     out.append(Violations((other, robot), samples[hits]))
         return out
@@ -102,7 +120,14 @@ class FineCheck:
         return np.array(sorted(hits), dtype=int)
 
     def _pair(
-        self, a: str, b: str, x: dict[str, np.ndarray], samples: Samples, arrangement: Arrangement, spheres: dict
+        self,
+        a: str,
+        b: str,
+        x: dict[str, np.ndarray],
+        samples: Samples,
+        arrangement: Arrangement,
+        spheres: dict,
+        tight: np.ndarray,
     ) -> np.ndarray:
         close = self.nearness.close((spheres[a], spheres[b]), CULL)
         if not len(close):
@@ -115,7 +140,8 @@ class FineCheck:
         for s in np.unique(samples.segment[close]).tolist():
             i = close[samples.segment[close] == s]
             held_a, held_b = (arrangement.modes[s].held.get(r) for r in (a, b))
-            exact = (samples.t[i] == 0) | (samples.t[i] == 1)
+            lo, t = samples.lo[i], samples.t[i]
+            exact = (t == 0) | (t == 1) | tight[lo] | tight[np.minimum(lo + 1, len(tight) - 1)]
             one, two = (x[a][i], held_a), (x[b][i], held_b)
             first, second = (two, one) if swapped else (one, two)
 
@@ -126,7 +152,7 @@ class FineCheck:
         return np.array(sorted(hits), dtype=int)
 
 
-def _all_hits(first_hit, rows: np.ndarray) -> np.ndarray:
+def _all_hits(first_hit: Callable[[np.ndarray], int], rows: np.ndarray) -> np.ndarray:
     """All rows for which a query that returns the first hit, or -1, finds one."""
     out, start = [], 0
     while start < len(rows):

@@ -109,8 +109,8 @@ class Carriers:
         for name, bodies in scene.free_bodies.items():
             prefix = name.split(":", 1)[0]
             holder = prefix if ("held", prefix) in self.number else next(iter(scene.robots))
-            key = ("object", name) if ("object", name) in self.number else ("held", holder)
-            out.update(dict.fromkeys(geometry_ids(plant, bodies), self.number[key]))
+            number = self.number.get(("object", name), self.number["held", holder])
+            out.update(dict.fromkeys(geometry_ids(plant, bodies), number))
         return out
 
 
@@ -126,7 +126,13 @@ def _ask(
             plant.SetPositions(context, row)
             query = port.Eval(context)
             found = [
-                (p.distance, p.nhat_BA_W, query.GetPoseInWorld(p.id_A).multiply(p.p_ACa), carrier[p.id_A], carrier[p.id_B])
+                (
+                    p.distance,
+                    p.nhat_BA_W,
+                    query.GetPoseInWorld(p.id_A).multiply(p.p_ACa),
+                    carrier[p.id_A],
+                    carrier[p.id_B],
+                )
                 for p in query.ComputeSignedDistancePairwiseClosestPoints(reach)
             ]
             last = row
@@ -173,7 +179,13 @@ class Nearness:
         return np.concatenate([centres, load], axis=1), np.concatenate([radii, size], axis=1)
 
     def rows(
-        self, robot: str, q: np.ndarray, held: Attachment | None, poses: Mapping[str, np.ndarray], spheres: tuple, far: float
+        self,
+        robot: str,
+        q: np.ndarray,
+        held: Attachment | None,
+        poses: Mapping[str, np.ndarray],
+        spheres: tuple,
+        far: float,
     ) -> np.ndarray:
         """Positions of the robot's plant, with those resting objects whose spheres come within `far` (m)."""
         world = self.worlds[robot]

@@ -11,9 +11,7 @@ from mrtamp.plan import Transition
 from mrtamp.problem import AtConfiguration, Problem, RobotAt
 
 
-def pins(
-    problem: Problem, line: Polyline, transitions: Sequence[Transition], slide: bool
-) -> dict[str, np.ndarray]:
+def pins(problem: Problem, line: Polyline, transitions: Sequence[Transition], slide: bool) -> dict[str, np.ndarray]:
     """Robot -> knots (K,) at which its configuration stays; with `slide` only where no stratum offers freedom."""
     K = line.knots
     out = {r: np.zeros(K, dtype=bool) for r in line.columns}

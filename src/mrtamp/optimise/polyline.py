@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -86,17 +87,16 @@ class Polyline:
     def parts(self, q: np.ndarray) -> list[dict[str, np.ndarray]]:
         """Waypoints per segment and robot for knots q (K, N)."""
         bounds = [0, *self.events.tolist(), self.knots - 1]
-        return [
-            {r: q[a : b + 1, c].copy() for r, c in self.columns.items()}
-            for a, b in zip(bounds[:-1], bounds[1:], strict=True)
-        ]
+        return [{r: q[a : b + 1, c].copy() for r, c in self.columns.items()} for a, b in pairwise(bounds)]
 
     def at(self, u: np.ndarray) -> Polyline:
         """The polyline with knots at parameters u (K',), ascending, which include all events and ends of stretches."""
         low = np.minimum(u.astype(int), max(self.knots - 2, 0))
         high = np.minimum(low + 1, self.knots - 1)
         t = (u - low)[:, None]
-        q = np.where(t == 0, self.q[low], np.where(t == 1, self.q[high], self.q[low] + t * (self.q[high] - self.q[low])))
+        q = np.where(
+            t == 0, self.q[low], np.where(t == 1, self.q[high], self.q[low] + t * (self.q[high] - self.q[low]))
+        )
         index = np.searchsorted(u, np.arange(self.knots))
         stretches = tuple(s.shifted(index) for s in self.stretches)
         return Polyline(self.columns, q, index[self.events], stretches)
@@ -221,7 +221,9 @@ def _walk(q: np.ndarray, knot: int, step: int, stop: int, tool: Tool, cuts: set[
         if away.max() > 1.01 * REACH:
             if k == near or away[0] < 0.5 * REACH:
                 i = int(np.argmax(away > REACH))
-                cuts.add(k + step * float(t[i - 1] + (REACH - away[i - 1]) / (away[i] - away[i - 1]) * (t[i] - t[i - 1])))
+                cuts.add(
+                    k + step * float(t[i - 1] + (REACH - away[i - 1]) / (away[i] - away[i - 1]) * (t[i] - t[i - 1]))
+                )
             break
         k += step
     return k, near

@@ -102,7 +102,9 @@ class Linearised:
     upper: np.ndarray
 
 
-def solve(reduction: Reduction, q: np.ndarray, weights: CostWeights, rows: Linearised) -> tuple[np.ndarray, float] | None:
+def solve(
+    reduction: Reduction, q: np.ndarray, weights: CostWeights, rows: Linearised
+) -> tuple[np.ndarray, float] | None:
     """Minimise the linearised cost; returns x = (z, y) and its cost, or None where Clarabel finds no optimum.
 
     `q` (K, N) are the knots; x are changes of them and of the scaled coordinates.
@@ -142,8 +144,10 @@ def solve(reduction: Reduction, q: np.ndarray, weights: CostWeights, rows: Linea
         low[length + row], high[length + row] = 0.0, np.inf
     if long > 0:
         each = np.arange(robots * steps)
-        entries = (np.concatenate([np.ones(len(each)), -np.ones(len(each))]),
-                   (np.concatenate([each, each]), np.concatenate([each, robots * steps + each % steps])))
+        entries = (
+            np.concatenate([np.ones(len(each)), -np.ones(len(each))]),
+            (np.concatenate([each, each]), np.concatenate([each, robots * steps + each % steps])),
+        )
         order = sparse.csc_matrix(entries, shape=(len(each), robots * steps + steps))
         program.AddLinearConstraint(order, np.full(len(each), -np.inf), np.zeros(len(each)), x[length:slack])
     else:

@@ -1,0 +1,179 @@
+"""Collision rows of the program: linearised distances at knots, midpoints, and wherever a step went wrong before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from mrtamp.collision import PADDING
+from mrtamp.optimise.choices import Arrangement
+from mrtamp.optimise.fine import Violations, Who, contact_of, knot_samples
+from mrtamp.optimise.nearness import Near, Nearness, Samples
+from mrtamp.optimise.polyline import Polyline
+
+Demands = dict[Who, dict[tuple[int, float, int], int]]
+"""Who -> (step, fraction, segment) -> how often they have to be clearer there than elsewhere."""
+
+_NEAR = 0.06
+"""Distance (m) below which pairs of solids enter the program."""
+_MARGIN = 1.5e-3
+"""Clearance (m) that the program asks for at its samples."""
+_STRICTER = 1e-3
+"""Additional clearance (m) for every time that a sample was in collision."""
+_FINER = 3.0
+"""By how much both are less at every finer level."""
+_TOUCHING = -3e-4
+"""Clearance (m) asked of an object and what it is lifted off or put on."""
+_SHARE = 0.25
+"""Share of the tolerated penetration that every pair may use."""
+_PARTS = 12
+"""Places in a step at which violations are remembered."""
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionRows:
+    """Linearised distances: A (P, K * N + coordinates), and how far (P,) each may shrink.
+
+    `deepest` is the largest penetration (m) beyond what is allowed.
+    """
+
+    A: sparse.csr_array
+    gap: np.ndarray
+    deepest: float
+
+    def joined(self, other: CollisionRows) -> CollisionRows:
+        """These rows and others."""
+        A = sparse.csr_array(sparse.vstack([self.A, other.A]))
+        return CollisionRows(A, np.concatenate([self.gap, other.gap]), max(self.deepest, other.deepest))
+
+
+class Collisions:
+    """Linearises distances along polylines, and remembers where more clearance is needed than was asked for."""
+
+    def __init__(self, nearness: Nearness, tolerance: float) -> None:
+        self.nearness = nearness
+        self.tolerance = tolerance
+        self.level = 0
+        self._demands: Demands = {}
+
+    # -- demands ----------------------------------------------------------------------------------------------------
+
+    def forget(self) -> None:
+        """Ask for no more than everywhere."""
+        self._demands = {}
+
+    def learn(self, violations: Sequence[Violations]) -> Demands:
+        """Every violating sample becomes a row of the next programs, stricter each time it recurs; returns them."""
+        fresh: Demands = {}
+        for v in violations:
+            for lo, t, s in zip(v.samples.lo.tolist(), v.samples.t.tolist(), v.samples.segment.tolist(), strict=True):
+                key = self.demand(v.who, lo, t, s)
+                fresh.setdefault(v.who, {})[key] = self._demands[v.who][key]
+        return fresh
+
+    def demand(self, who: Who, lo: int, t: float, segment: int, depth: float = 0.0) -> tuple[int, float, int]:
+        """Ask for more clearance at one place, where the penetration was `depth` (m)."""
+        rows = self._demands.setdefault(who, {})
+        key = (lo, round(t * _PARTS) / _PARTS, segment)
+        rows[key] = rows.get(key, 0) + 1 + int(np.ceil(depth / _STRICTER * _FINER**self.level))
+        return key
+
+    def move(self, u: np.ndarray) -> None:
+        """The polyline now has knots at parameters u of the one before."""
+        moved: Demands = {}
+        for who, rows in self._demands.items():
+            moved[who] = {}
+            for (lo, t, segment), strict in rows.items():
+                at = float(np.interp(lo + t, u, np.arange(len(u))))
+                k = min(int(at), max(len(u) - 2, 0))
+                moved[who][k, round((at - k) * _PARTS) / _PARTS, segment] = strict
+        self._demands = moved
+
+    def _samples(self, base: Samples, extra: Mapping[tuple[int, float, int], int]) -> tuple[Samples, np.ndarray]:
+        """The samples of a query and the clearance (S,) asked for at each."""
+        least = _MARGIN / _FINER**self.level - _SHARE * self.tolerance
+        margin = np.full(len(base), least)
+        if not extra:
+            return base, margin
+        lo, t, segment = (np.array(x) for x in zip(*extra, strict=True))
+        strict = least + _STRICTER / _FINER**self.level * np.array(list(extra.values()))
+        return base.joined(Samples(lo, t, segment)), np.concatenate([margin, strict])
+
+    # -- rows -------------------------------------------------------------------------------------------------------
+
+    def rows(self, line: Polyline, q: np.ndarray, arrangement: Arrangement) -> CollisionRows:
+        """Distances and their gradients at knots, midpoints, and wherever they were demanded; q (K, N) are the knots."""
+        return self._rows(line, q, arrangement, knot_samples(line, np.full(line.knots - 1, 2)), self._demands)
+
+    def more(self, line: Polyline, q: np.ndarray, arrangement: Arrangement, demands: Demands) -> CollisionRows:
+        """The same at some demanded places only."""
+        return self._rows(line, q, arrangement, Samples.none(), demands)
+
+    def _rows(
+        self, line: Polyline, q: np.ndarray, arrangement: Arrangement, base: Samples, demands: Demands
+    ) -> CollisionRows:
+        blocks: list[sparse.csr_array] = [sparse.csr_array((0, q.size + len(arrangement.c)))]
+        gaps: list[np.ndarray] = [np.zeros(0)]
+        deepest = 0.0
+        names = list(line.columns)
+        for i, robot in enumerate(names):
+            for other in (None, *names[:i]):
+                who: Who = (robot,) if other is None else (other, robot)
+                samples, margin = self._samples(base, demands.get(who, {}))
+                if not len(samples):
+                    continue
+                knots = {r: q[:, line.columns[r]] for r in who}
+                if other is None:
+                    near = self.nearness.world(robot, knots[robot], samples, arrangement, _NEAR)
+                    asked = np.where(self._touching(line, robot, samples, near), _TOUCHING, margin[near.sample])
+                else:
+                    near = self.nearness.between(other, robot, knots[other], knots[robot], samples, arrangement, _NEAR)
+                    asked = margin[near.sample]
+                if len(near.distance):
+                    # Where robots stand, their shapes count without padding.
+                    allowed = np.minimum(asked, 0) - (0.0 if other is None else 2 * PADDING)
+                    deepest = max(deepest, float((allowed - near.distance).max()) - self.tolerance)
+                    blocks.append(self.gradient(line, samples, near, knots, arrangement))
+                    gaps.append(near.distance - asked)
+        return CollisionRows(sparse.csr_array(sparse.vstack(blocks)), np.concatenate(gaps), deepest)
+
+    def _touching(self, line: Polyline, robot: str, samples: Samples, near: Near) -> np.ndarray:
+        """Pairs (P,) of a load and what it is being lifted off or put on."""
+        number = self.nearness.carriers.number
+        numbers = {"": -2}
+        contact = contact_of(line.stretches, robot, samples)
+        for name in set(contact) - {""}:
+            numbers[name] = number.get(("static", name), number.get(("object", name), -2))
+        support = np.array([numbers[c] for c in contact], dtype=int)[near.sample]
+        held = number["held", robot]
+        return ((near.a == held) & (near.b == support)) | ((near.b == held) & (near.a == support))
+
+    def gradient(
+        self, line: Polyline, samples: Samples, near: Near, knots: Mapping[str, np.ndarray], arrangement: Arrangement
+    ) -> sparse.csr_array:
+        """Rows over flattened knots and coordinates: a row between two knots involves both."""
+        N = line.q.shape[1]
+        lo, t = samples.lo[near.sample], samples.t[near.sample]
+        P = len(lo)
+        values, rows, columns = [], [], []
+        x = {r: samples.at(k) for r, k in knots.items()}
+        for robot in knots:
+            G = self.nearness.joint_gradient(robot, x[robot], near)
+            cols = line.columns[robot]
+            joint = np.arange(cols.start, cols.stop)
+            for knot, weight in ((lo, 1 - t), (np.minimum(lo + 1, line.knots - 1), t)):
+                values.append((G * weight[:, None]).reshape(-1))
+                rows.append(np.repeat(np.arange(P), len(joint)))
+                columns.append((knot[:, None] * N + joint).reshape(-1))
+        H = self.nearness.choice_gradient(near, samples, x, arrangement)
+        r, k = np.nonzero(H)
+        values.append(H[r, k])
+        rows.append(r)
+        columns.append(line.q.size + k)
+        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+        out = sparse.csr_array(entries, shape=(P, line.q.size + len(arrangement.c)))
+        out.eliminate_zeros()
+        return out
