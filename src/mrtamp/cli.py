@@ -184,7 +184,7 @@ def _report_plan(
 
 def _bound_text(cost: float, bound: float | None) -> str:
     """How far the plan is from the cheapest decoupled skeleton; that bounds what these transitions allow, no more."""
-    if bound is None:
+    if not bound:
         return ""
     return (
         f"sampled bound: {bound:.3f} ({cost / bound - 1:+.1%}): the cheapest assignment and order over the transitions "

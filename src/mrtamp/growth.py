@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 Timed = tuple[list[Segment], list[Transition]]
 """Motions and the transitions between them."""
+_VARIETY = 0.3
+"""How often stops happen in another order when a skeleton is realised once more."""
 _SAME = 1e-9
 Combination = tuple[Candidate, ...]
 """Elementary transitions of disjoint robots that happen at the same instant."""
@@ -142,6 +144,7 @@ class Growth:
             proposal.before,
             lambda k, mode: skeletons.candidate(stops[k], mode),
             self.goal_vertices,
+            _VARIETY if proposal.repeated else 0.0,
         )
         if timed is None:
             assert self.insertion.stuck is not None
@@ -152,7 +155,7 @@ class Growth:
     def adopt(self, segments: Sequence[Segment], transitions: Sequence[Transition], root: Node) -> Node:
         """Put a checked plan into the roadmaps and the tree, so that the search builds on it; its last node.
 
-        Every knot becomes a vertex of its robots' roadmaps, every transition a contact that candidates may use.
+        Every knot becomes a vertex of its robots' roadmaps.
         """
         node = root
         for k, segment in enumerate(segments):

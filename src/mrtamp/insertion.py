@@ -83,6 +83,7 @@ class Insertion:
         before: Sequence[Sequence[int]],
         stand: Stand,
         goal: Mapping[str, int],
+        variety: float = 0.0,
     ) -> tuple[list[Segment], list[Transition]] | None:
         """Motions that bring about the stops and end at the goal vertices, or None.
 
@@ -92,6 +93,7 @@ class Insertion:
         robots : who takes part in every stop, in an order of stops that is possible for every robot.
         before : numbers of the stops that have to happen earlier than each.
         stand : transitions at the stops.
+        variety : how often (0 to 1) a stop that can happen next does so although another could happen sooner.
         """
         self.stuck = None
         self._known.clear()
@@ -107,6 +109,8 @@ class Insertion:
                 done = [x for x in tried if x is not None]
                 if done:
                     after = min(done, key=lambda x: x.time.events[-1])
+                    if self.rng.random() < variety:
+                        after = done[int(self.rng.integers(len(done)))]
                     break
             if after is None:
                 self.stuck = ready[0] if ready else state.pending[0]

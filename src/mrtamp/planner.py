@@ -44,6 +44,12 @@ _FIRST_WAYS, _MORE_WAYS = (40, 14), (64, 20)
 """IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
 _REALISATIONS = 6
 """Skeletons that are tried at a time."""
+_WORTH_ADOPTING = 0.01
+"""Relative gain over what the tree has for which a refined plan is put into it."""
+_COVER = 3200
+"""Initial vertices of a robot with n joints: at least this over the square of n."""
+_GROWTH = 30
+"""Roadmaps grow by at least one part in so many per iteration."""
 _REWIRINGS = 6
 """Steps that may be validated for rewiring per insertion, once there is a plan."""
 _HOPE = 1.0
@@ -138,7 +144,9 @@ class Planner:
         self.sampler.remember(mode)
         self.root = self.growth.start(mode)
         for robot in problem.robots:
-            self._add_interior(robot.name, self.options.initial_vertices)
+            # A space of few dimensions is soon covered, and then paths in it are nearly shortest.
+            n = robot.start.size
+            self._add_interior(robot.name, max(self.options.initial_vertices, _COVER // n**2))
         self.skeletons = SkeletonGuidance(problem, self.sampler, self.guidance, mode)
         self.portfolio = Portfolio(
             problem,
@@ -310,7 +318,7 @@ class Planner:
     def _expand_roadmaps(self, orbit: int) -> None:
         """SampleOrbitInterior and ExpandRoadmaps: every constituent roadmap keeps growing."""
         for name in self.names:
-            self._add_interior(name, self.options.interior_samples)
+            self._add_interior(name, max(self.options.interior_samples, self.roadmaps[name].n_vertices // _GROWTH))
 
     def _add_interior(self, name: str, n: int) -> None:
         """n samples; half uniform, half around known vertices, where passages matter most; free ones are kept."""
@@ -422,6 +430,8 @@ class Planner:
     def _realise_skeletons(self) -> bool:
         """Grow the sets of ways and realise the cheapest skeletons that may beat the incumbent, until one succeeds."""
         first = self.best is None
+        if not first:
+            self._expand_roadmaps(0)
         self.skeletons.grow(*(_FIRST_WAYS if first else _MORE_WAYS))
         self.skeletons.update_bound()
         for _ in range(_REALISATIONS):
@@ -443,12 +453,15 @@ class Planner:
         """A checked plan that the tree does not have yet: into the tree, and under refinement."""
         better = self.incumbent.offer(plan, self._elapsed())
         if self._uses("adoption"):
-            node = self.growth.adopt(plan.segments, plan.transitions, self.root)
-            self._tree_cost = min(self._tree_cost, node.cost)
-            if better:
-                self._path = list(dict.fromkeys(x.orbit for x in self.tree.branch(node)))
+            self._graft(plan)
         self._found(plan)
         return better
+
+    def _graft(self, plan: Plan) -> None:
+        """Put a checked plan into the roadmaps and the tree; guidance follows its orbits from now on."""
+        node = self.growth.adopt(plan.segments, plan.transitions, self.root)
+        self._tree_cost = min(self._tree_cost, node.cost)
+        self._path = list(dict.fromkeys(x.orbit for x in self.tree.branch(node)))
 
     def _found(self, plan: Plan) -> None:
         """There is a new plan: it is refined, and from now on the tree is rewired."""
@@ -503,7 +516,12 @@ class Planner:
     def _refine(self) -> bool:
         """Give refinement its turn; whether there is a better plan."""
         plan = self.portfolio.improve(self._cost())
-        return plan is not None and self.incumbent.offer(plan, self._elapsed())
+        better = plan is not None and self.incumbent.offer(plan, self._elapsed())
+        for settled in self.portfolio.settled() if self._uses("adoption") else []:
+            self.skeletons.learn(settled)
+            if settled.cost < self._tree_cost * (1 - _WORTH_ADOPTING):
+                self._graft(settled)
+        return better
 
     # -- reports --------------------------------------------------------------------------------------------------
 

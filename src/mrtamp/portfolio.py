@@ -87,6 +87,7 @@ class Portfolio:
         self.convex = convex
         self.sliding = sliding
         self._entries: list[_Entry] = []
+        self._settled: list[Plan] = []
 
     def add(self, plan: Plan) -> None:
         """Put a checked plan under refinement; when there are too many, the dearest that is finished goes."""
@@ -172,6 +173,12 @@ class Portfolio:
         gained = entry.before - entry.plan.cost > WORTH_CHECKING * entry.plan.cost
         entry.fruitless = 0 if gained else entry.fruitless + 1
         entry.done, entry.refiner, entry.optimiser = True, None, None
+        self._settled.append(entry.plan)
+
+    def settled(self) -> list[Plan]:
+        """Plans whose refinement has converged since this was last asked."""
+        out, self._settled = self._settled, []
+        return out
 
     def _offer(self, entry: _Entry, incumbent: float, work: Refiner | Optimiser) -> Plan | None:
         """Have a plan checked that is clearly cheaper than the incumbent; where the judge objects, look closer."""

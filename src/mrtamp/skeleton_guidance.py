@@ -7,6 +7,8 @@ where that fails or is dearer, the ways concerned are held to be dearer too (DES
 
 from __future__ import annotations
 
+import itertools
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -14,7 +16,10 @@ import numpy as np
 
 from mrtamp.guidance import ModalGuidance
 from mrtamp.modes import Attachment, Mode
+from mrtamp.plan import Plan
 from mrtamp.problem import HeldBy, Problem, RobotAt
+from mrtamp.roadmap import lazy_path
+from mrtamp.schedule import FAR, Distance
 from mrtamp.skeletons import Event, Option, Skeleton, Task, lower_bound, skeletons
 from mrtamp.transitions.candidate import Candidate
 from mrtamp.transitions.sampler import TransitionSampler
@@ -22,10 +27,16 @@ from mrtamp.transitions.ways import Stop, Way, Ways
 
 _FAILED = 2.0
 """Added to the estimated cost of a way (rad) whose stop could not be realised."""
-_NEW = 0.03
-"""Relative gain of the estimate for which an order of events that was realised before is realised again."""
+_REPEATED = 0.04
+"""How much dearer an order of events seems for every time that it was realised before."""
+_FEW = 30
+"""Stops per robot up to which distances are those of the roadmaps."""
+_GROWN = 1.15
+"""Growth of a roadmap after which distances on it are computed anew."""
 _TRIES = 4
 """Calls without result after which a set of ways is grown now and then only."""
+_ROUNDS = 200
+"""Lazy searches for the length of one roadmap path."""
 _LIMIT = 12
 _MOST = 120
 """Ways per option that are handed to the search for skeletons."""
@@ -35,12 +46,14 @@ _MOST = 120
 class Proposal:
     """A skeleton and its stops in the order in which they happen, with the ways they belong to.
 
-    `before` lists for every stop the numbers of those that must happen earlier.
+    `before` lists for every stop the numbers of those that must happen earlier; `repeated` is how often this order was
+    realised already.
     """
 
     skeleton: Skeleton
     stops: tuple[tuple[Stop, Way], ...]
     before: tuple[tuple[int, ...], ...]
+    repeated: int
 
 
 class SkeletonGuidance:
@@ -61,7 +74,8 @@ class SkeletonGuidance:
         self.rng = sampler.rng
         self.ways = Ways(sampler)
         self.bound: float | None = None
-        self._realised: dict[tuple, float] = {}
+        self._realised: Counter[tuple] = Counter()
+        self._lengths: dict[tuple[str, int, int], tuple[int, float]] = {}
         self._reaching: dict[tuple[str, int], Way] = {}
         self.items = self._in_order([o for o in root.of if not guidance.done(root, o)])
         # A goal that ends with an object in a hand is the search's business.
@@ -175,22 +189,66 @@ class SkeletonGuidance:
     # -- proposals ------------------------------------------------------------------------------------------------
 
     def propose(self, below: float = np.inf) -> Iterator[Proposal]:
-        """The cheapest skeletons that were not realised yet and whose estimate is less than `below`."""
+        """Skeletons whose estimate is less than `below`, cheapest first, those realised before held back a little."""
         sets = self._options()
         if sets is None or not self.applies:
             return
         tasks = [Task(name, tuple(self._option(w, penalised=True) for w in ways)) for name, ways in sets.items()]
         starts = {r.name: r.start for r in self.problem.robots}
         found = skeletons(
-            tasks, self._precedence(), starts, self._ends(), self.problem.cost, limit=_LIMIT, rng=self.rng
+            tasks,
+            self._precedence(),
+            starts,
+            self._ends(),
+            self.problem.cost,
+            limit=_LIMIT,
+            rng=self.rng,
+            distance=self._distance(sets),
         )
+        found.sort(key=lambda x: x.cost * (1 + _REPEATED * self._realised[x.order]))
         for skeleton in found:
-            known = self._realised.get(skeleton.order, np.inf)
-            if skeleton.cost >= below or skeleton.cost > known * (1 - _NEW):
+            if skeleton.cost >= min(below, FAR):
                 continue
             ways = {name: sets[name][o][m] for name, (o, m) in skeleton.choices.items()}
             stops = tuple((ways[h.task].stops[h.event], ways[h.task]) for h in skeleton.happenings)
-            yield Proposal(skeleton, stops, self._before(skeleton, sets))
+            yield Proposal(skeleton, stops, self._before(skeleton, sets), self._realised[skeleton.order])
+
+    def _distance(self, sets: Mapping[str, list[list[Way]]]) -> Distance | None:
+        """Lengths of roadmap paths where stops are few and stand on the roadmaps; else None: straight lines."""
+        ways = [w for options in sets.values() for option in options for w in option]
+        stops = [(r, v) for w in ways for s in w.stops for r, v in (s.at or {}).items()]
+        if any(s.at is None for w in ways for s in w.stops) or len(stops) > _FEW * len(self.problem.robots):
+            return None
+        roadmaps = self.sampler.roadmaps
+        vertex = {(r, roadmaps[r].q[v].tobytes()): v for r, v in stops}
+        for robot in self.problem.robots:
+            vertex[robot.name, robot.start.tobytes()] = 0
+        for condition in self.problem.goal:
+            if isinstance(condition, RobotAt):
+                same = np.flatnonzero(np.max(np.abs(roadmaps[condition.robot].q - condition.q), axis=1) == 0)
+                vertex[condition.robot, condition.q.tobytes()] = int(same[0])
+
+        def distance(robot: str, A: np.ndarray, B: np.ndarray) -> np.ndarray:
+            rows, columns = ([vertex[robot, q.tobytes()] for q in X] for X in (A, B))
+            return np.array([[self._length(robot, a, b) for b in columns] for a in rows])
+
+        return distance
+
+    def _length(self, robot: str, a: int, b: int) -> float:
+        """Length of the shortest roadmap path between two vertices past the static world; infinite without one."""
+        if a == b:
+            return 0.0
+        a, b = min(a, b), max(a, b)
+        roadmap, validity = self.sampler.roadmaps[robot], self.sampler.validity
+        known = self._lengths.get((robot, a, b))
+        if known is None or roadmap.n_vertices > _GROWN * known[0]:
+            roadmap.offer_direct(a, b)
+            blocked = validity.blocked(robot, self.root, {})
+            path = lazy_path(roadmap, a, b, blocked, lambda e: validity.edge(robot, e, self.root), _ROUNDS)
+            pairs = itertools.pairwise(path or [])
+            length = sum(float(np.linalg.norm(roadmap.q[u] - roadmap.q[v])) for u, v in pairs) if path else np.inf
+            known = self._lengths[robot, a, b] = (roadmap.n_vertices, length)
+        return known[1]
 
     def _before(self, skeleton: Skeleton, sets: Mapping[str, list[list[Way]]]) -> tuple[tuple[int, ...], ...]:
         """What has to happen before every happening: the earlier events of its task, and what precedence says."""
@@ -208,7 +266,9 @@ class SkeletonGuidance:
             return
         tasks = [Task(name, tuple(self._option(w, penalised=False) for w in ways)) for name, ways in sets.items()]
         starts = {r.name: r.start for r in self.problem.robots}
-        self.bound = lower_bound(tasks, self._precedence(), starts, self._ends(), self.problem.cost).value
+        distance = self._distance(sets)
+        bound = lower_bound(tasks, self._precedence(), starts, self._ends(), self.problem.cost, distance=distance)
+        self.bound = bound.value if bound.value < FAR else None
 
     def failed(self, way: Way) -> None:
         """A stop of this way could not be reached, or its transition could not happen."""
@@ -216,8 +276,26 @@ class SkeletonGuidance:
         way.penalty += _FAILED
 
     def realised(self, proposal: Proposal) -> None:
-        """A proposal became a plan; others get their turn, and this order again only when its estimate improves."""
-        self._realised[proposal.skeleton.order] = proposal.skeleton.cost
+        """A proposal became a plan; others get their turn, and this order again when it still seems cheapest."""
+        self._realised[proposal.skeleton.order] += 1
+
+    def learn(self, plan: Plan) -> None:
+        """Take over the transitions of a refined plan as ways, so that later skeletons may combine them anew."""
+        fixed = {b for o in self.items for s in self.sampler.goal_supports[o] for b in (s.body,) if b in self.root.of}
+        for item in self.items:
+            if item in fixed or any(s.body in self.root.of for s in self.sampler.goal_supports[item]):
+                # Solved for one planned placement; those of the plan need not be the same.
+                continue
+            stops = []
+            for segment, transition in zip(plan.segments, plan.transitions, strict=False):
+                for a in transition.actions:
+                    if a.object == item:
+                        q = {r: segment.q[r][-1].copy() for r in a.robots}
+                        stops.append(Stop(a.kind, a.robots, a.before, a.after, q))
+            robots = tuple(dict.fromkeys(r for s in stops for r in s.robots))
+            carried = [s.kind for s in stops] == ["pick", "place"] and len(robots) == 1
+            if carried and stops[0].before is self.root.of[item]:
+                self.ways.of.setdefault((item, robots), []).append(Way(tuple(stops)))
 
     # -- realisation ----------------------------------------------------------------------------------------------
 

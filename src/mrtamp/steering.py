@@ -19,8 +19,8 @@ from mrtamp.roadmap import Roadmap, lazy_path
 from mrtamp.tensor_tree import At, Node, as_mapping
 from mrtamp.validity import Validity
 
-ROUNDS = 40
-"""Lazy searches per path before the oracle gives up."""
+ROUNDS = 100
+"""Lazy searches per path before the oracle gives up: a way out of a narrow place may take many, some 1 ms each."""
 _ASIDE = 6
 _ASIDE_ROUNDS = 8
 """The same for a robot that only has to get out of the way: there are other places to go to."""

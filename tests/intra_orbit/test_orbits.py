@@ -242,6 +242,15 @@ def test_rewiring_goes_on_until_no_neighbour_is_worth_it() -> None:
     check(setting)
 
 
+def test_a_step_from_outside_becomes_a_step_of_the_tensor_product() -> None:
+    a = roadmap("a", [(0, 0), (1, 0), (2, 0)], [(0, 1), (1, 2)])
+    b = roadmap("b", [(0, 9), (1, 9)], [])
+    setting = Setting(Flatland([a, b], 0.2), [a, b], (0, 0))
+    far = setting.insert(setting.root, (2, 1))
+    assert far.at in set(tensor_neighbours(setting.roadmaps, setting.root.at))
+    assert [x.at for x in setting.tree.adjacent(far)[0]] == [(0, 0)]
+
+
 def test_neighbours_in_the_tree_are_those_of_the_tensor_product() -> None:
     setting = crowd()
     grow(setting, np.random.default_rng(0), 400)

@@ -48,6 +48,10 @@ class Orbits:
 
     def insert(self, node: Node, at: At) -> tuple[Node, bool]:
         """InsertAndRewire: a validated step from `node` to `at`; returns (the node at its end, whether it is new)."""
+        for g, u, v in zip(self.roadmaps, node.at, at, strict=True):
+            # A step that comes from outside the search is an edge of the roadmaps from now on, open to all.
+            if u != v:
+                g.edge(u, v)
         reached, new = self.tree.insert(node, at)
         self._join(node, reached)
         if self.rewirings:

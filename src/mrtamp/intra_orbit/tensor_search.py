@@ -4,7 +4,7 @@ Shome, Solovey, Dobson, Halperin and Bekris (2020): the informed oracle sends ev
 shortest roadmap path.  Here each robot with a target advances or waits, which also aligns edges of different lengths,
 and the cheapest estimate (cost so far and the robots' own costs-to-go) is tried next.  A step is validated when its
 turn comes; where one fails, the robots that met are offered sidesteps.  What this does not solve within its bounds is
-left to moving robots one at a time.
+left to moving robots one at a time, which is also compared with wherever sidesteps were taken.
 """
 
 from __future__ import annotations
@@ -76,8 +76,11 @@ class TensorSearch:
             if not all(self._prepare(search, node, i, v) for i, v in goal.items()):
                 return None
             together = self._together(search, node)
-            if together is not None:
+            if together is not None and not search.offered:
                 return together
+            # Sidesteps are random, and may have led a long way round.
+            apart = self.one_by_one.drive(node, targets, depth)
+            return min((x for x in (together, apart) if x is not None), key=lambda x: x.cost, default=None)
         return self.one_by_one.drive(node, targets, depth)
 
     def explore(self, node: Node) -> Node | None:

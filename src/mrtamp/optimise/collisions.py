@@ -105,7 +105,7 @@ class Collisions:
     # -- rows -------------------------------------------------------------------------------------------------------
 
     def rows(self, line: Polyline, q: np.ndarray, arrangement: Arrangement) -> CollisionRows:
-        """Distances and their gradients at knots, midpoints, and wherever they were demanded; q (K, N) are the knots."""
+        """Distances and their gradients at knots, midpoints, and wherever they were demanded, at knots q (K, N)."""
         return self._rows(line, q, arrangement, knot_samples(line, np.full(line.knots - 1, 2)), self._demands)
 
     def more(self, line: Polyline, q: np.ndarray, arrangement: Arrangement, demands: Demands) -> CollisionRows:
