@@ -5,15 +5,15 @@ Every row runs in a process of its own, so that nothing is warm and its peak mem
 
 from __future__ import annotations
 
-import resource
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
+
+from mrtamp.bench_run import Task, Tell, apart, peak_mb, pick_place
+from mrtamp.bench_table import Line
 
 FIRST_BUDGET_S = 60.0
 
@@ -22,35 +22,28 @@ FIRST_BUDGET_S = 60.0
 class Row:
     """One problem of the table: what to load, the median aimed for (s), and what the paper needed (24 cores)."""
 
-    problem: str
-    parameters: dict[str, int]
+    task: Task
     aim_s: float
     paper: str
 
     @property
     def name(self) -> str:
-        """The problem, with robots/objects where it is generated."""
-        if not self.parameters:
-            return self.problem
-        return f"{self.problem} {self.parameters['robots']}/{self.parameters['objects']}"
-
-
-def _pick_place(robots: int, objects: int, aim_s: float, paper: str) -> Row:
-    return Row("pick_place", {"robots": robots, "objects": objects}, aim_s, paper)
+        """The name of the problem."""
+        return self.task.name
 
 
 FIRST = (
-    Row("box", {}, 1.0, "10 s"),
-    Row("handover", {}, 1.0, "12 s"),
-    Row("stacking", {}, 2.0, "47 s"),
-    _pick_place(2, 2, 0.5, "4 s"),
-    _pick_place(2, 4, 1.0, "30 s"),
-    _pick_place(2, 6, 1.5, "53 s"),
-    _pick_place(3, 3, 1.0, "7 s"),
-    _pick_place(3, 6, 2.0, "111 s"),
-    _pick_place(4, 4, 2.0, "57 s"),
-    _pick_place(4, 6, 3.0, "176 s (80 %)"),
-    _pick_place(8, 24, 60.0, "-"),
+    Row(Task("box"), 1.0, "10 s"),
+    Row(Task("handover"), 1.0, "12 s"),
+    Row(Task("stacking"), 2.0, "47 s"),
+    Row(pick_place(2, 2), 0.5, "4 s"),
+    Row(pick_place(2, 4), 1.0, "30 s"),
+    Row(pick_place(2, 6), 1.5, "53 s"),
+    Row(pick_place(3, 3), 1.0, "7 s"),
+    Row(pick_place(3, 6), 2.0, "111 s"),
+    Row(pick_place(4, 4), 2.0, "57 s"),
+    Row(pick_place(4, 6), 3.0, "176 s (80 %)"),
+    Row(pick_place(8, 24), 60.0, "-"),
 )
 
 
@@ -63,23 +56,21 @@ class Result:
     peak_mb: float
 
 
-def measure(row: Row, seeds: Sequence[int], budget_s: float) -> Result:
+def measure(task: Task, seeds: Sequence[int], budget_s: float, tell: Tell) -> Result:
     """Run one row in this process."""
     from mrtamp.planner import Planner
-    from mrtamp.problem_file import load_problem
 
     seconds: list[float | None] = []
     costs: list[float | None] = []
     for seed in seeds:
-        problem = load_problem(row.problem, **row.parameters)
+        tell(f"seed {seed}")
+        problem = task.load()
         start = time.perf_counter()
         planner = Planner(problem, seed=seed)
         found = next(planner.improve(budget_s, first=True), None)
         seconds.append(time.perf_counter() - start if found else None)
         costs.append(found.cost if found else None)
-    # Kilobytes on Linux, bytes on macOS.
-    unit = 1024**2 if sys.platform == "darwin" else 1024
-    return Result(seconds, costs, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit)
+    return Result(seconds, costs, peak_mb())
 
 
 def start_to_exit() -> float:
@@ -90,25 +81,31 @@ def start_to_exit() -> float:
     return time.perf_counter() - start
 
 
-def first_plans(seeds: int, rows: Sequence[Row] = FIRST, say: Callable[[str], None] = print) -> bool:
+def first_plans(seeds: int, rows: Sequence[Row], line: Line) -> bool:
     """Print the table of first plans, row by row; returns whether every row succeeded within its aim."""
-    say(
+    line.say(
         "| problem | success | median first plan | slowest | aim | median cost | peak memory | the paper |\n"
         f"|{'---|' * 8}"
     )
     good = True
     for row in rows:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            result = pool.submit(measure, row, range(seeds), FIRST_BUDGET_S).result()
+        result: Result = apart(measure, row.task, range(seeds), FIRST_BUDGET_S, tell=_shown(line, row.name))
         times = [t for t in result.seconds if t is not None]
         # A run without a plan counts as the whole budget.
         median = statistics.median(t if t is not None else FIRST_BUDGET_S for t in result.seconds)
         cost = statistics.median([c for c in result.costs if c is not None]) if times else float("nan")
         good &= len(times) == seeds and median <= row.aim_s
-        say(
+        line.say(
             f"| {row.name} | {len(times)}/{seeds} | {median:.2f} s | {max(times, default=float('nan')):.2f} s "
             f"| {row.aim_s:g} s | {cost:.1f} | {result.peak_mb:.0f} MB | {row.paper} |"
         )
+    line.show("a whole command, start to exit")
     whole = statistics.median(start_to_exit() for _ in range(seeds))
-    say(f"\n`mrtamp plan pick_place --robots 2 --objects 2 --first`, start to exit: median {whole:.2f} s (aim 4 s)")
+    line.say(
+        f"\n`mrtamp plan pick_place --robots 2 --objects 2 --first`, start to exit: median {whole:.2f} s (aim 4 s)"
+    )
     return good and whole < 4.0
+
+
+def _shown(line: Line, name: str) -> Tell:
+    return lambda text: line.show(f"{name}, {text}")

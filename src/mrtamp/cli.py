@@ -1,4 +1,4 @@
-"""The command line: list, plan, check, view, show.
+"""The command line: list, plan, check, view, show, bench.
 
 Exit codes: 0 a plan was found and checked (or the check passed), 1 no plan within the budget (or the check failed),
 2 bad input.  Everything that takes long to import is imported inside the command that needs it.
@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from mrtamp.bench_cli import add_suites
 from mrtamp.mechanisms import INTRA_ORBIT_NAMES, MECHANISMS
 
 if TYPE_CHECKING:
@@ -254,16 +255,16 @@ def _serve(what: Plan | Problem, options: argparse.Namespace) -> None:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from mrtamp import bench
+    """One suite of measurements; `options.suite` plans and prints it."""
+    from mrtamp.bench_table import Line
 
-    rows = [row for row in bench.FIRST if options.only in row.name]
-    if not rows:
-        names = ", ".join(row.name for row in bench.FIRST)
-        raise _BadInput(f"--only: found {options.only!r}, expected part of one of: {names}")
-    with _stop_on_signals():
+    for path in (options.raw, options.plot, options.writes()):
+        _ensure_writable(path)
+    with _stop_on_signals(), Line(sys.stderr, lambda text: print(text, flush=True)) as line:
         try:
-            good = bench.first_plans(options.seeds, rows, lambda text: print(text, flush=True))
+            good = options.suite(options, line)
         except KeyboardInterrupt:
+            line.say("stopped: the rows above are what was finished")
             return NOT_FOUND
     return FOUND if good else NOT_FOUND
 
@@ -425,12 +426,11 @@ def _parser() -> argparse.ArgumentParser:
     show.add_argument("--html", type=Path, metavar="FILE", help="write a page instead of opening a window")
     show.set_defaults(run=_show)
 
-    bench = commands.add_parser("bench", help="measure: time to the first checked plan, as a table")
-    bench.add_argument("suite", choices=["first"], help="first: the paper's tasks, time to the first checked plan")
-    bench.add_argument("--seeds", type=count, default=5, metavar="N", help="planner seeds per row (default 5)")
-    bench.add_argument("--only", metavar="TEXT", default="", help="only the rows whose name contains TEXT")
+    bench = commands.add_parser("bench", help="measure: first plans, costs, convergence, memory, mechanisms; as tables")
     bench.set_defaults(run=_bench)
+    add_suites(bench, count, seconds)
     return parser
+
 
 
 if __name__ == "__main__":

@@ -213,6 +213,9 @@ class Growth:
 
     def towards_goal(self, near: Node) -> Node | None:
         """In a mode that satisfies the goal, bring the robots to where they have to end; the node there, or None."""
+        together = self.motion.drive(near, self.goal_vertices)
+        if together is not None:
+            return together
         for name in [str(x) for x in self.rng.permutation(list(self.goal_vertices))]:
             near = self.motion.drive(near, {name: self.goal_vertices[name]}) or near
         # Whoever was sent aside comes back at the end.

@@ -505,7 +505,7 @@ class Planner:
                 self.growth.repair(report, groups)
                 if node.alive and self.tree.branch(node) == branch:
                     # Whatever is wrong is not a step that could be withdrawn.
-                    self.tree.cut(node)
+                    self.growth.orbits.remove(node)
                 return False
         better = self.incumbent.offer(plan, self._elapsed())
         if better:

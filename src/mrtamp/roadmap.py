@@ -132,6 +132,10 @@ class Roadmap:
             self._samples[e] = known
         return known
 
+    def samples_between(self, a: np.ndarray, b: np.ndarray) -> int:
+        """How many samples of the straight motion a -> b keep every tracked point's steps within the resolution."""
+        return samples_between(self.world, self._points, a, b)
+
     def path_samples(self, e: int, n: int | None = None) -> np.ndarray:
         """Configurations (n, dof) along the edge from its first to its second end."""
         a, b = self._ends[e]

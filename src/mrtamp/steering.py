@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from mrtamp.connect import Connector
 from mrtamp.intra_orbit.lazy_validate import step_is_valid
 from mrtamp.modes import Mode
 from mrtamp.roadmap import Roadmap, lazy_path
@@ -25,6 +26,8 @@ _ASIDE = 6
 _ASIDE_ROUNDS = 8
 """The same for a robot that only has to get out of the way: there are other places to go to."""
 
+_SEARCHES, _TREE = 4, 40
+"""How often a way that the roadmap lacks is looked for between two vertices, and tree extensions, doubled each time."""
 Insert = Callable[[Node, At], Node]
 
 
@@ -40,6 +43,8 @@ class Steering:
         self.rng = rng
         self.index = {g.name: i for i, g in enumerate(roadmaps)}
         self.trouble: Counter[tuple[str, str]] = Counter()
+        self.connector = Connector(validity, rng)
+        self._sought: Counter[tuple] = Counter()
 
     def drive(self, node: Node, targets: Mapping[str, int], depth: int = 1) -> Node | None:
         """Bring robots to target vertices, one after another, others standing; None if some cannot get there.
@@ -127,7 +132,18 @@ class Steering:
             if self.validity.label((robot, mode.held.get(robot), other, v, mode.held.get(other))).hit:
                 blockers[other] += 1
         blocked = self.validity.blocked(robot, mode, standing)
-        return lazy_path(roadmap, start, goal, blocked, validate, rounds), blockers
+        path = lazy_path(roadmap, start, goal, blocked, validate, rounds)
+        if path is None and not blockers and self._connects(roadmap, mode, start, goal):
+            blocked = self.validity.blocked(robot, mode, standing)
+            path = lazy_path(roadmap, start, goal, blocked, validate, rounds)
+        return path, blockers
+
+    def _connects(self, roadmap: Roadmap, mode: Mode, start: int, goal: int) -> bool:
+        """The roadmap has no way where no other robot is to blame: look for one, harder each time, and not for ever."""
+        key = (roadmap.name, mode.key, start, goal)
+        self._sought[key] += 1
+        tries = self._sought[key]
+        return tries <= _SEARCHES and self.connector.connect(roadmap, mode, start, goal, _TREE << tries)
 
     def _follow(self, node: Node, robot: str, path: list[int]) -> Node:
         i = self.index[robot]

@@ -29,7 +29,7 @@ _TOUCHING = -3e-4
 """Clearance (m) asked of an object and what it is lifted off or put on."""
 _SHARE = 0.25
 """Share of the tolerated penetration that every pair may use."""
-_PARTS = 12
+_PARTS = 24
 """Places in a step at which violations are remembered."""
 
 

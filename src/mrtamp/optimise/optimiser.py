@@ -37,7 +37,9 @@ _SHALLOW = 1e-3
 """Penetration (m) at the program's own samples that makes a finer look pointless."""
 _TRUE, _FALSE = 0.7, 0.25
 _STALL = 1e-3
-_PATIENCE = 3
+_PATIENCE = 6
+_CHANCE, _WORTH = 6, 3e-4
+"""Steps after which a finer polyline has to have gained that share."""
 _EPS = 1e-9
 
 
@@ -93,6 +95,7 @@ class Optimiser:
         self.trust = TRUST
         self.converged = False
         self._stalls = 0
+        self._refined = (0, np.inf)
         self._promise = 0.0
         self.collisions = Collisions(self.nearness, problem.collision.tolerance)
         self._changes = sum(self.weights.transitions.get(a.kind, 0.0) for t in transitions for a in t.actions)
@@ -130,6 +133,7 @@ class Optimiser:
         """The judge refused the best iterate: ask for more clearance where it collided, and go on from there."""
         refused = self._best
         self._best, self.converged, self._stalls = self._sure, False, 0
+        self._refined = (self.steps, np.inf)
         self.trust = max(self.trust, 4 * _SMALLEST)
         self._return_to(refused)
         bounds = [0, *refused.line.events.tolist()]
@@ -199,28 +203,34 @@ class Optimiser:
         if clean and candidate.cost < self._best.cost - _EPS:
             gain = self._best.cost - candidate.cost
             self._best = candidate
-        self._pace(before, after, self._promise + self._changes)
+        self._pace(before, after, self._promise + self._changes, clean)
         if self._now is candidate and candidate.line.lengths(candidate.q).max() > 1.4 * self.knot:
             self._resample()
         return gain
 
-    def _pace(self, before: float, after: float, promised: float) -> None:
+    def _pace(self, before: float, after: float, promised: float, clean: bool) -> None:
         """Adapt the trust region to how much of the promised gain came true."""
         share = (before - after) / max(before - promised, 1e-9)
         if share > _TRUE:
             self.trust = min(1.3 * self.trust, _LARGEST)
         elif share < _FALSE:
-            self.trust *= 0.5
-        self._stalls = self._stalls + 1 if before - promised < _STALL * before or share < _FALSE else 0
+            # What is missing only at samples between those of the program needs rows, not smaller steps.
+            self.trust = 0.5 * self.trust if clean else max(0.5 * self.trust, min(self.trust, 4 * _SMALLEST))
+        still = before - promised < _STALL * before or share < _FALSE
+        self._stalls = 0 if not still else self._stalls + (2 if clean else 1)
         self._settle(self.trust < _SMALLEST or self._stalls >= _PATIENCE)
 
     def _settle(self, done: bool) -> None:
-        """Where the polyline has converged, go on with finer steps beside its bends."""
+        """Where the polyline has converged, go on with finer steps beside its bends, unless that gains nothing."""
+        since, cost = self._refined
+        if self.collisions.level > 0 and self.steps - since >= _CHANCE:
+            done = done or self._best.cost > (1 - _WORTH) * cost
         if done and self.collisions.level < self.levels:
             self.collisions.level += 1
+            self.collisions.forget()
+            self._refined = (self.steps, self._best.cost)
             self._stalls, self.trust = 0, TRUST / 2**self.collisions.level
             self._return_to(self._best)
-            self.collisions.forget()
             self._resample()
         else:
             self.converged = done

@@ -1,0 +1,107 @@
+"""Tables in Markdown that grow row by row, with a line on stderr that says what is being measured meanwhile."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import statistics
+import threading
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import TextIO
+
+from mrtamp.progress import LOG_PERIOD, TERMINAL_PERIOD
+
+Say = Callable[[str], None]
+"""Prints a line of a table."""
+
+
+class Line:
+    """The last line of stderr: what is being measured, for how long already; from two seconds on."""
+
+    def __init__(self, stream: TextIO, say: Say = print) -> None:
+        self._stream = stream
+        self._say = say
+        self._terminal = stream.isatty()
+        self._text = ""
+        self._shown = ""
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Line:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join()
+        self._clear()
+
+    def show(self, text: str) -> None:
+        """What is going on now."""
+        self._text = text
+
+    def say(self, text: str) -> None:
+        """Print a line of the result."""
+        with self._lock:
+            self._clear()
+            self._say(text)
+
+    def _run(self) -> None:
+        began = time.monotonic()
+        while not self._over.wait(TERMINAL_PERIOD if self._terminal else LOG_PERIOD):
+            if self._text and time.monotonic() - began >= LOG_PERIOD:
+                with self._lock:
+                    self._draw(f"{time.monotonic() - began:6.0f} s  {self._text}")
+
+    def _draw(self, text: str) -> None:
+        if self._terminal:
+            self._write("\r\x1b[2K" + text[: shutil.get_terminal_size().columns - 1])
+        else:
+            self._write(text + "\n")
+
+    def _clear(self) -> None:
+        if self._terminal:
+            self._write("\r\x1b[2K")
+
+    def _write(self, text: str) -> None:
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except (OSError, ValueError):
+            # Whoever read the progress has gone; the measurement matters more.
+            self._over.set()
+
+
+# -- numbers ---------------------------------------------------------------------------------------------------------
+
+
+def median(values: Sequence[float]) -> float:
+    """The median; infinite where more than half of the values are (no plan), or there are none."""
+    return statistics.median(values) if values else float("inf")
+
+
+def number(value: float | None, form: str = ".3f", unit: str = "") -> str:
+    """A number in a table; a dash for what there is not."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    return f"{value:{form}}{unit}"
+
+
+def yes_or_no(ok: bool) -> str:
+    """Bold where it is not as it should be."""
+    return "yes" if ok else "**no**"
+
+
+def header(*columns: str) -> str:
+    """The first two lines of a table in Markdown."""
+    return f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}"
+
+
+def table_row(*cells: str) -> str:
+    """A line of a table in Markdown."""
+    return f"| {' | '.join(cells)} |"
