@@ -101,15 +101,19 @@ def _raw(file: Path | None) -> Iterator[Callable[[Run], None]]:
 # -- arguments -------------------------------------------------------------------------------------------------------
 
 
-def add_suites(bench: argparse.ArgumentParser, count: Callable[[str], float], amount: Callable[[str], float]) -> None:
+Converter = Callable[[str], float]
+
+
+def add_suites(bench: argparse.ArgumentParser, positive: Callable[[Callable[[str], float], str], Converter]) -> None:
     """Add the suites to `mrtamp bench`.
 
     The namespace gets `suite`, which measures and prints; `raw` and `plot`, the files it writes; `update`.
 
     Parameters
     ----------
-    count, amount : converters of whole numbers from 1, and of positive numbers.
+    positive : makes the converter of an argument from a type of number and what is expected, in words.
     """
+    count = positive(int, "a whole number from 1")
     suites = bench.add_subparsers(title="suites", metavar="SUITE", required=True)
 
     def suite(name: str, run: Callable[..., bool], seeds: int, help: str) -> argparse.ArgumentParser:
@@ -143,16 +147,28 @@ def add_suites(bench: argparse.ArgumentParser, count: Callable[[str], float], am
     optimum = suite("optimum", _optimum, 10, "convergence to the known optima of the planar problems")
     optimum.add_argument("--plot", type=_svg, metavar="FILE", help="draw every run, their mean and the optimum (SVG)")
     endurance = suite("endurance", _endurance, 1, "memory and cost over a long run")
-    endurance.add_argument("--minutes", type=amount, default=10.0, metavar="M", help="length of a run (default 10)")
+    endurance.add_argument(
+        "--minutes",
+        type=positive(float, "a positive number of minutes"),
+        default=10.0,
+        metavar="M",
+        help="length of a run (default 10)",
+    )
     raw(endurance)
     update(endurance)
     ablation = suite("ablation", _ablation, 5, "what each mechanism is worth: the same runs without it")
-    ablation.add_argument("--budget", type=amount, default=10.0, metavar="S", help="seconds per run (default 10)")
+    ablation.add_argument(
+        "--budget",
+        type=positive(float, "a positive number of seconds"),
+        default=10.0,
+        metavar="S",
+        help="seconds per run (default 10)",
+    )
     raw(ablation)
 
 
 def _budgets(text: str) -> tuple[float, ...]:
-    meaning = "positive seconds separated by commas, such as 10,60"
+    meaning = "positive numbers of seconds, separated by commas, such as 10,60"
     try:
         values = {float(part) for part in text.split(",")}
     except ValueError:

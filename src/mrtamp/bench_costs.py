@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from mrtamp.bench_best import BestKnown, best_of
+from mrtamp.bench_best import Best, BestKnown, best_of
 from mrtamp.bench_run import Run, Task, measure, pick_place
 from mrtamp.bench_table import Line, header, median, number, table_row, yes_or_no
 
@@ -74,8 +74,8 @@ def costs(
             "problem",
             "best known",
             "success",
-            f"first plan, worst (aim {FIRST_AIM:g})",
-            *(f"at {t:g} s, worst (aim)" for t in budgets),
+            f"first plan: median, worst (aim {FIRST_AIM:g})",
+            *(f"at {t:g} s: median, worst (aim)" for t in budgets),
             "makespan",
             "path length",
             "makespan / path length",
@@ -87,7 +87,7 @@ def costs(
     good, notes = True, []
     for row in rows:
         runs: list[Run] = []
-        before = known.cost(row.task)
+        before, better = known.cost(row.task), ""
         try:
             for seed in range(seeds):
                 run = measure(row.task, seed, budgets[-1], line)
@@ -95,12 +95,13 @@ def costs(
                 keep(run)
                 best = best_of(run, command)
                 if best is not None and (known.update if update else known.see)(row.task, best):
-                    notes.append(_better(row, before, best.cost, seed, update))
+                    better = _better(row, before, best, update)
         finally:
             if runs:
                 text, within = cost_row(row, runs, known.cost(row.task), budgets)
                 line.say(text)
                 good &= within
+                notes += [better] if better else []
                 for run in runs:
                     notes += [f"{row.name}, seed {run.seed}: {refusal}" for refusal in run.refused]
             if len(runs) < seeds:
@@ -109,9 +110,10 @@ def costs(
     return good
 
 
-def _better(row: CostRow, before: float, cost: float, seed: int, update: bool) -> str:
+def _better(row: CostRow, before: float, best: Best, update: bool) -> str:
+    was = f"the best known was {before:.4f}" if before < float("inf") else "none was known"
     what = "written" if update else "not written: --update does"
-    return f"{row.name}, seed {seed}: {cost:.4f} is better than the best known, {number(before, '.4f')} ({what})"
+    return f"{row.name}, seed {best.seed}: a plan of cost {best.cost:.4f}; {was} ({what})"
 
 
 def _explain(line: Line, notes: Sequence[str]) -> None:

@@ -258,7 +258,12 @@ def _bench(options: argparse.Namespace) -> int:
     """One suite of measurements; `options.suite` plans and prints it."""
     from mrtamp.bench_table import Line
 
-    for path in (options.raw, options.plot, options.writes()):
+    files = [options.raw, options.plot]
+    if options.update:
+        from mrtamp.bench_best import best_known_file
+
+        files.append(best_known_file())
+    for path in files:
         _ensure_writable(path)
     with _stop_on_signals(), Line(sys.stderr, lambda text: print(text, flush=True)) as line:
         try:
@@ -428,9 +433,8 @@ def _parser() -> argparse.ArgumentParser:
 
     bench = commands.add_parser("bench", help="measure: first plans, costs, convergence, memory, mechanisms; as tables")
     bench.set_defaults(run=_bench)
-    add_suites(bench, count, seconds)
+    add_suites(bench, _positive)
     return parser
-
 
 
 if __name__ == "__main__":

@@ -253,11 +253,13 @@ class RobotPair:
         held_b: Attachment | None,
         widths: tuple[float | None, float | None] = (None, None),
         exact: np.ndarray | None = None,
+        loads: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
     ) -> int:
         """Index of the first pair of rows of qa (N, na), qb (N, nb) in collision, or -1.
 
         `widths` are the openings (m) of hands that hold nothing; None: fully open.  `exact` (N,) says at which rows the
         robots may stand: there the shapes count as they are, without padding, which is for motion between samples.
+        `loads` are the poses of what is held (N, 7), see `load_poses`, where they are known already.
         """
         rows = np.repeat(self._template[None], len(qa), axis=0)
         for i, (q, held) in enumerate(((qa, held_a), (qb, held_b))):
@@ -265,7 +267,10 @@ class RobotPair:
             rows[:, in_scene.arm] = q
             rows[:, in_scene.fingers] = in_scene.finger_positions(held.width if held else widths[i])
             if held is not None:
-                write_held(self.scene, rows, self.slot_of[i][held.object], self.worlds[i].tool, q, held)
+                known = loads[i]
+                poses = load_poses(self.worlds[i].tool, q, held) if known is None else known
+                k = self.scene.floating[self.slot_of[i][held.object]]
+                rows[:, k : k + 7] = poses
         plant, context, port = self._plant, self.context, self._port
         lenient = self.tolerance > 0
         for i, row in enumerate(rows):
@@ -287,10 +292,14 @@ class RobotPair:
 
 def write_held(scene: Scene, rows: np.ndarray, slot: str, tool: Tool, q: np.ndarray, held: Attachment) -> None:
     """Write the pose of a held object for configurations q (N, n) into position vectors (N, nq) in place."""
-    R, p = tool.pose(q)
     k = scene.floating[slot]
-    rows[:, k : k + 4] = quaternions(R @ held.X_PO[:3, :3])
-    rows[:, k + 4 : k + 7] = p + R @ held.X_PO[:3, 3]
+    rows[:, k : k + 7] = load_poses(tool, q, held)
+
+
+def load_poses(tool: Tool, q: np.ndarray, held: Attachment) -> np.ndarray:
+    """World poses (N, 7) of what is held at configurations q (N, n): quaternion (w, x, y, z), then position."""
+    R, p = tool.pose(q)
+    return np.concatenate([quaternions(R @ held.X_PO[:3, :3]), p + R @ held.X_PO[:3, 3]], axis=1)
 
 
 def _owners(scene: Scene) -> dict:

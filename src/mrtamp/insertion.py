@@ -104,9 +104,15 @@ class Insertion:
             ready = self._ready(state, robots, before)
             targets = self._targets(state, robots, stand, goal)
             after = None
+            soonest = self._soonest(state, ready, robots, stand)
             for depth in range(_DEPTH + 1):
-                tried = [self._happen(state, k, stand, targets, depth) for k in ready]
-                done = [x for x in tried if x is not None]
+                done: list[_State] = []
+                for k in sorted(ready, key=lambda k: soonest[k]):
+                    if done and variety == 0.0 and min(x.time.events[-1] for x in done) <= soonest[k]:
+                        break
+                    trial = self._happen(state, k, stand, targets, depth)
+                    if trial is not None:
+                        done.append(trial)
                 if done:
                     after = min(done, key=lambda x: x.time.events[-1])
                     if self.rng.random() < variety:
@@ -146,11 +152,29 @@ class Insertion:
                     out[r] = candidate.at[r]
         return out
 
+    def _soonest(
+        self, state: _State, ready: Sequence[int], robots: Sequence[Sequence[str]], stand: Stand
+    ) -> dict[int, float]:
+        """When each stop could happen at the earliest, were its robots alone."""
+        out = {}
+        for k in ready:
+            candidate = self._stand(k, state.mode, stand)
+            latest = float(max([0, *state.time.events[-1:]]))
+            for r, v in candidate.at.items() if candidate is not None else ():
+                q = self.roadmaps[r].q
+                way = np.linalg.norm(q[v] - q[state.at[r]]) / STEP
+                latest = max(latest, state.time.free_from[r] + float(np.ceil(way - 1e-9)))
+            out[k] = latest if candidate is not None else np.inf
+        return out
+
+    def _stand(self, k: int, mode: Mode, stand: Stand) -> Candidate | None:
+        if (k, mode) not in self._known:
+            self._known[k, mode] = stand(k, mode)
+        return self._known[k, mode]
+
     def _happen(self, state: _State, k: int, stand: Stand, targets: Mapping[str, int], depth: int) -> _State | None:
         """The schedule in which stop k happens next, or None."""
-        if (k, state.mode) not in self._known:
-            self._known[k, state.mode] = stand(k, state.mode)
-        candidate = self._known[k, state.mode]
+        candidate = self._stand(k, state.mode, stand)
         if candidate is None:
             return None
         trial: _State | None = state

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mrtamp.collision import RESOLUTION, Collision, bisection_order
+from mrtamp.collision import RESOLUTION, Collision, bisection_order, load_poses
 from mrtamp.modes import Attachment, Mode
 from mrtamp.plan import Segment
 from mrtamp.validity import Validity
 
-STEP = 0.12
+STEP = 0.3
 """Longest motion (rad or m) of a robot in one step of time."""
 _NEAR = 0.012
 """Clearance (m) of bounding spheres below which Drake is asked."""
@@ -61,6 +61,7 @@ class Clearances:
         self._pairs: dict[tuple, bool] = {}
         self._objects: dict[tuple, bool] = {}
         self._sampled: dict[tuple[str, int, int], tuple[np.ndarray, np.ndarray, np.ndarray, float]] = {}
+        self._rows: dict[tuple, tuple[np.ndarray, np.ndarray | None]] = {}
         self._balls: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
 
     def row(self, robot: str, q: np.ndarray) -> int:
@@ -130,12 +131,23 @@ class Clearances:
         if gap.min() > _NEAR:
             return True
         n = self._samples([(one, a), (two, b)]) if (a.a, b.a) != (a.b, b.b) else 1
-        t = np.linspace(0, 1, n)[bisection_order(n)][:, None]
-        qa = (1 - t) * self.tables[one][a.a] + t * self.tables[one][a.b]
-        qb = (1 - t) * self.tables[two][b.a] + t * self.tables[two][b.b]
+        first, second = ((two, b, held_b), (one, a, held_a)), ((one, a, held_a), (two, b, held_b))
         pair, swapped = self.collision.pair(one, two)
-        first, second = ((qb, held_b), (qa, held_a)) if swapped else ((qa, held_a), (qb, held_b))
-        return pair.first_hit(*first, *second, exact=(t[:, 0] == 0) | (t[:, 0] == 1)) < 0
+        (q, load), (q2, load2) = (self._along(*x, n) for x in (first if swapped else second))
+        ends = np.arange(n)[bisection_order(n)] % max(n - 1, 1) == 0
+        held = (held_b, held_a) if swapped else (held_a, held_b)
+        return pair.first_hit(q, held[0], q2, held[1], exact=ends, loads=(load, load2)) < 0
+
+    def _along(self, robot: str, move: Move, held: Attachment | None, n: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Samples (n, dof) of a move in bisection order, and the poses of the load there."""
+        key = (robot, move.a, move.b, held, n)
+        known = self._rows.get(key)
+        if known is None:
+            t = np.linspace(0, 1, n)[bisection_order(n)][:, None]
+            q = (1 - t) * self.tables[robot][move.a] + t * self.tables[robot][move.b]
+            known = (q, None if held is None else load_poses(self.worlds[robot].tool, q, held))
+            self._rows[key] = known
+        return known
 
     def among(self, robot: str, move: Move, held: Attachment | None, mode: Mode) -> bool:
         """Whether a move keeps clear of the objects that rest in `mode` but not in the mode it was checked in."""
@@ -250,6 +262,9 @@ class SpaceTime:
         """Index along the leg at every instant from `begin` to its arrival: A* over (time, index), waiting allowed."""
         m, last = leg.length, max(self.end, begin)
         others = [r for r in self.names if r not in leg.path]
+        if self.in_the_way(leg, [o for o in others if self.free_from[o] <= begin]):
+            # They stand there all the time.
+            return None
         parent: dict[tuple[int, int], tuple[int, int] | None] = {(begin, 0): None}
         queue: list[tuple[int, int, int]] = [(begin + m, 0, begin)]
         while queue:
@@ -280,12 +295,12 @@ class SpaceTime:
         m = leg.length
         return all(self._step(leg, others, m, m, s) for s in range(t, last))
 
-    def in_the_way(self, leg: Leg) -> list[str]:
-        """Robots that block a leg from where they stand in the end."""
+    def in_the_way(self, leg: Leg, among: Sequence[str] | None = None) -> list[str]:
+        """Robots (of `among`, default all) that block a leg from where they stand in the end."""
         pairs = [(r, path) for r, path in leg.path.items()]
         return [
             o
-            for o in self.names
+            for o in (self.names if among is None else among)
             if o not in leg.path
             and not all(
                 self.clearance.apart(

@@ -125,9 +125,11 @@ def test_a_square_is_covered_all_over_and_its_postures_too(panda: Planner) -> No
 def test_samples_near_known_vertices_and_anywhere_both_occur(panda: Planner) -> None:
     """Half of the seeds come from `near`; the other half keeps the whole set of postures reachable."""
     _, q = sampled(panda, "pose", 600)
-    spread = [np.linalg.norm(a - b) for a, b in combinations(q[:80], 2)]
+    different = np.unique(q.round(4), axis=0)
+    assert len(different) > 0.3 * len(q)
+    spread = [np.linalg.norm(a - b) for a, b in combinations(different[::4], 2)]
     assert np.median(spread) > 1.0
-    assert len(np.unique(q.round(4), axis=0)) > 0.8 * len(q)
+    assert len(different) < 0.7 * len(q), "from the only known vertex there is one way to go"
 
 
 def meeting_problem(folder: Path) -> Problem:
@@ -147,10 +149,11 @@ def test_discs_have_two_joints_so_ranks_are_those_that_matter(tmp_path: Path) ->
     line, point = (sampler.reaching.targets["meet"][r] for r in "ab")
     assert (line.rank, line.dimension) == (1, 1)
     assert (point.rank, point.dimension) == (2, 0)
-    q, on = line.sample(np.random.default_rng(0), 60, np.zeros((1, 2)))
-    assert on.all()
-    np.testing.assert_allclose(q[:, 1], 0.0, atol=1e-6)
+    q, on = line.sample(np.random.default_rng(0), 400, np.zeros((1, 2)))
+    np.testing.assert_allclose(q[on, 1], 0.0, atol=1e-6)
     assert [np.linalg.matrix_rank(D, tol=1e-6) for D in line.jacobian(q[:5])] == [1] * 5
+    counts = np.histogram(q[on, 0], bins=5, range=(-0.69, -0.31))[0]
+    assert counts.min() >= 5, "all over the line, although the box is thicker than the plane in which the disc moves"
 
 
 def test_candidates_are_combinations_of_vertices_at_the_targets_and_are_kept(tmp_path: Path) -> None:
@@ -167,7 +170,7 @@ def test_candidates_are_combinations_of_vertices_at_the_targets_and_are_kept(tmp
             for robot, v in c.at.items():
                 assert reaching.targets["meet"][robot].contains(parts.roadmaps[robot].q[[v]]).all()
     known = reaching.known(parts.root, subgoal)
-    assert len(known) == total >= 20
+    assert len(known) == total >= 10
     assert len({tuple(sorted(c.at.items())) for c in known}) == total, "each of them once"
     assert len({c.at["b"] for c in known}) == 1, "a configuration is one vertex, however often it is sampled"
     stats = sampler.outcomes["reach", ("a", "b"), "", "meet"]

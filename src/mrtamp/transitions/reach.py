@@ -93,9 +93,11 @@ class ReachTarget:
             X = self.target.X_WG.GetAsMatrix4()
             R, p = np.tile(X[:3, :3], (n, 1, 1)), np.tile(X[:3, 3], (n, 1))
         else:
-            # Some of the way towards the nearest point of the box, the rest anywhere in it: paths often touch its edge.
+            # Towards the nearest point of the box or anywhere in it: paths often touch its edge.  A mixture by coordinate,
+            # because hands that move in a plane only cannot follow a coordinate out of it.
             anywhere = rng.uniform(-self._half, self._half, size=(n, 3))
-            local = np.where(rng.random(n)[:, None] < 0.5, anywhere, np.clip(self._local(p), -self._half, self._half))
+            drawn = rng.random((n, 3)) < rng.random((n, 1))
+            local = np.where(drawn, anywhere, np.clip(self._local(p), -self._half, self._half))
             p = (local - self._X_CW[:3, 3]) @ self._X_CW[:3, :3]
         q, solved = solve_ik(self.tool, R, p, seeds)
         return q, solved & self.contains(q, 1e-4)
