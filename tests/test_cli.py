@@ -82,13 +82,14 @@ def test_json_is_the_only_thing_on_stdout(capsys: pytest.CaptureFixture[str]) ->
 
 def test_no_plan_is_exit_1_with_a_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "plan.json"
-    assert main(["plan", "stacking", "--iterations", "1", "--out", str(out)]) == 1
+    hopeless = ("stacking", "--iterations", "1", "--without", "skeletons")
+    assert main(["plan", *hopeless, "--out", str(out)]) == 1
     assert "no plan within 1 iterations" in capsys.readouterr().out
     assert not out.exists()
-    assert main(["plan", "stacking", "--iterations", "1", "--json"]) == 1
+    assert main(["plan", *hopeless, "--json"]) == 1
     data = json.loads(capsys.readouterr().out)
     assert data["ok"] is False and "1 iterations" in data["reason"] and "explanation" in data
-    assert main(["plan", "stacking", "--iterations", "1", "--quiet"]) == 1
+    assert main(["plan", *hopeless, "--quiet"]) == 1
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.count("\n") == 1
 
@@ -127,6 +128,10 @@ def test_view_and_show_write_pages(planned: Path, tmp_path: Path, capsys: pytest
         (["check", "nowhere.json"], "nowhere.json"),
         (["view", "nowhere.json"], "nowhere.json"),
         (["show", "nowhere"], "nowhere"),
+        (["bench", "costs", "--only", "2/9"], "pick_place 2/4"),
+        (["bench", "optimum", "--only", "box"], "planar_doorway"),
+        (["bench", "endurance", "--raw", "."], "directory"),
+        (["bench", "optimum", "--plot", "/proc/nowhere/plot.svg"], "/proc/nowhere/plot.svg"),
     ],
 )
 def test_bad_input_is_exit_2_with_one_message(arguments: list[str], words: str, capsys) -> None:
@@ -148,6 +153,13 @@ def test_bad_input_is_exit_2_with_one_message(arguments: list[str], words: str, 
         ["plan", "handover", "--iterations", "-3"],
         ["plan", "handover", "--seed", "-1"],
         ["plan", "handover", "--json", "--quiet"],
+        ["bench"],
+        ["bench", "sprint"],
+        ["bench", "costs", "--budgets", "1,x"],
+        ["bench", "costs", "--budgets", "10,0"],
+        ["bench", "endurance", "--minutes", "0"],
+        ["bench", "ablation", "--seeds", "1.5"],
+        ["bench", "optimum", "--plot", "plot.png"],
     ],
 )
 def test_wrong_arguments_are_exit_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -209,6 +221,21 @@ def test_a_signal_before_the_first_plan_is_exit_1(tmp_path: Path) -> None:
     assert "without a plan" in stdout
     assert "Traceback" not in stderr
     assert not out.exists()
+
+
+def test_a_signal_keeps_the_rows_that_were_measured(tmp_path: Path) -> None:
+    raw = tmp_path / "raw.json"
+    process = start("bench", "costs", "--only", "pick_place", "--seeds", "1", "--budgets", "2", "--raw", str(raw))
+    try:
+        assert process.stdout is not None
+        row = next(line for line in process.stdout if line.startswith("| pick_place 2/2 |"))
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert process.returncode == 1, stderr
+    assert "| 1/1 |" in row and "stopped" in stdout and "Traceback" not in stderr
+    assert [run["name"] for run in json.loads(raw.read_text(encoding="utf-8"))["runs"]] == ["pick_place 2/2"]
 
 
 def test_live_window_says_where_it_is_and_ends_with_a_signal(planned: Path) -> None:

@@ -13,6 +13,8 @@ from typing import TextIO
 
 from mrtamp.progress import LOG_PERIOD, TERMINAL_PERIOD
 
+_LOG_AGAIN_S = 10.0
+"""Seconds between two lines in a file or a pipe after the first."""
 Say = Callable[[str], None]
 """Prints a line of a table."""
 
@@ -52,11 +54,13 @@ class Line:
             self._say(text)
 
     def _run(self) -> None:
-        began = time.monotonic()
-        while not self._over.wait(TERMINAL_PERIOD if self._terminal else LOG_PERIOD):
-            if self._text and time.monotonic() - began >= LOG_PERIOD:
+        began, due = time.monotonic(), LOG_PERIOD
+        while not self._over.wait(TERMINAL_PERIOD):
+            elapsed = time.monotonic() - began
+            if self._text and elapsed >= due:
                 with self._lock:
-                    self._draw(f"{time.monotonic() - began:6.0f} s  {self._text}")
+                    self._draw(f"{elapsed:6.0f} s  {self._text}")
+                due = elapsed + (TERMINAL_PERIOD if self._terminal else _LOG_AGAIN_S)
 
     def _draw(self, text: str) -> None:
         if self._terminal:

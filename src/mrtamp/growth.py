@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 Timed = tuple[list[Segment], list[Transition]]
 """Motions and the transitions between them."""
-_VARIETY = 0.3
-"""How often stops happen in another order when a skeleton is realised once more."""
+_VARIETY = 0.4
+"""How often stops happen in another order, and legs take another way, when a skeleton is realised once more."""
 _SAME = 1e-9
 Combination = tuple[Candidate, ...]
 """Elementary transitions of disjoint robots that happen at the same instant."""
@@ -155,15 +155,17 @@ class Growth:
     def adopt(self, segments: Sequence[Segment], transitions: Sequence[Transition], root: Node) -> Node:
         """Put a checked plan into the roadmaps and the tree, so that the search builds on it; its last node.
 
-        Every knot becomes a vertex of its robots' roadmaps.
+        Every knot becomes a vertex of its robots' roadmaps.  Its neighbours are rewired when the search next comes by.
         """
         node = root
+        rewirings, self.orbits.rewirings = self.orbits.rewirings, 0
         for k, segment in enumerate(segments):
             for i in range(1, segment.length):
                 node = self._insert(node, self._vertices(node, {r: q[i] for r, q in segment.q.items()}))
             if k < len(transitions):
                 cost = sum(self.problem.cost.transitions.get(a.kind, 0.0) for a in transitions[k].actions)
                 node = self.orbits.enter(node, transitions[k], segments[k + 1].mode, cost)
+        self.orbits.rewirings = rewirings
         if self._is_goal(node) and node not in self.goal_nodes:
             self.goal_nodes.append(node)
         return node

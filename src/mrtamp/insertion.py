@@ -23,6 +23,8 @@ from mrtamp.validity import Validity
 
 _DEPTH = 2
 """How many robots may have to move for one another in a chain."""
+_WILD = 0.25
+"""Share of the edges that are closed, at random, where a leg is to take another way."""
 _ASIDE = 6
 """Random vertices offered to a robot that is in the way."""
 
@@ -74,6 +76,7 @@ class Insertion:
         self._rows: dict[tuple[str, int], int] = {}
         self._edges: dict[tuple[str, int, int], list[int]] = {}
         self._known: dict[tuple[int, Mode], Candidate | None] = {}
+        self._variety = 0.0
 
     def realise(
         self,
@@ -93,9 +96,11 @@ class Insertion:
         robots : who takes part in every stop, in an order of stops that is possible for every robot.
         before : numbers of the stops that have to happen earlier than each.
         stand : transitions at the stops.
-        variety : how often (0 to 1) a stop that can happen next does so although another could happen sooner.
+        variety : how often (0 to 1) a stop that can happen next does so although another could happen sooner, and a
+            leg takes another way than the shortest.
         """
         self.stuck = None
+        self._variety = variety
         self._known.clear()
         q = {r: self.roadmaps[r].q[v] for r, v in start.items()}
         time = SpaceTime(self._clearances, q, [root])
@@ -247,7 +252,8 @@ class Insertion:
     def _leg(self, state: _State, robot: str, v: int) -> Leg | None:
         at = tuple(state.at[r] for r in self.names)
         others = {r for r in self.names if r != robot}
-        path, _ = self.steering.path(state.mode, at, robot, v, ignore=others)
+        wild = _WILD if self.rng.random() < self._variety else 0.0
+        path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, wild=wild)
         if path is None:
             return None
         rows = [state.time.at[robot]]

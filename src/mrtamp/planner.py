@@ -48,8 +48,11 @@ _WORTH_ADOPTING = 0.01
 """Relative gain over what the tree has for which a refined plan is put into it."""
 _COVER = 3200
 """Initial vertices of a robot with n joints: at least this over the square of n."""
-_GROWTH = 30
-"""Roadmaps grow by at least one part in so many per iteration."""
+_GROWTH = 1.0
+"""Roadmaps grow by at least so many times the square root of their size per iteration: in proportion to their size they
+would grow exponentially, and less and less exploration would fit into a second."""
+_RAREST = 7
+"""Binary logarithm of the longest pause, in iterations, between attempts at skeletons that lead to nothing new."""
 _REWIRINGS = 6
 """Steps that may be validated for rewiring per insertion, once there is a plan."""
 _HOPE = 1.0
@@ -137,7 +140,7 @@ class Planner:
         self.iteration = 0
         self._path: list[int] = []
         self._tree_cost = np.inf
-        self._judged: set[int] = set()
+        self._stale = self._skeletons_from = 0
         self.incumbent = Incumbent(problem, seed, self.counts)
         self.incumbent.check_start()
         mode = start_mode(problem)
@@ -160,8 +163,8 @@ class Planner:
             sliding=self._uses("sliding"),
         )
         self._effort = Effort(
-            {"search": 0.05, "skeletons": 0.1, "refinement": 0.1},
-            {"search": 0.0, "skeletons": 0.15, "refinement": 0.85},
+            {"search": 0.05, "skeletons": 0.08, "refinement": 0.1},
+            {"search": 0.0, "skeletons": 0.1, "refinement": 0.9},
             {"refinement": self.options.refinement_share},
         )
         self._timed = True
@@ -227,7 +230,7 @@ class Planner:
 
     def _next_activity(self) -> str:
         """Before the first plan search and skeletons in turn; then what is behind its share."""
-        skeletons = self._uses("skeletons") and self.skeletons.applies
+        skeletons = self._uses("skeletons") and self.skeletons.applies and self.iteration >= self._skeletons_from
         if self.best is None:
             return "skeletons" if skeletons and self.iteration % _SKELETON_TURN == 0 else "search"
         refine = self._uses("refinement") and not self.portfolio.idle(self._cost())
@@ -256,8 +259,7 @@ class Planner:
         along = self.best is not None and self._uses("orbit-path-guidance") and self.rng.random() < 0.5
         modal = self._uses("modal-guidance")
         if explore or not (along or modal):
-            orbits = [o for o in self.graphs.orbital.nodes if self.tree.of_orbit.get(o)] or [0]
-            orbit = orbits[int(self.rng.integers(len(orbits)))]
+            orbit = self._any_orbit()
         elif along:
             orbit = self._orbit_path_guidance()
         else:
@@ -268,6 +270,19 @@ class Planner:
         if explore or not modal:
             return orbit, self.guidance.feasible_sets(mode, self.rng)
         return orbit, self._optimistic_choices(mode)
+
+    def _any_orbit(self) -> int:
+        """A living orbit, drawn uniformly from all or from those of a modal state that is drawn first.
+
+        Orbits grow in number for ever and so does, slowly, the count of draws of each; modal states are finitely many,
+        and so is what can be done in them: that keeps its share.
+        """
+        known = [[o for o in orbits if self.tree.of_orbit.get(o)] for orbits in self.graphs.orbits_of.values()]
+        known = [orbits for orbits in known if orbits]
+        if self.rng.random() < 0.5:
+            known = [[o for orbits in known for o in orbits]]
+        orbits = known[int(self.rng.integers(len(known)))]
+        return orbits[int(self.rng.integers(len(orbits)))]
 
     def _modal_frontier(self) -> int:
         """The orbit of the modal state that is optimistically nearest to the goal, visits held against it."""
@@ -318,7 +333,7 @@ class Planner:
     def _expand_roadmaps(self, orbit: int) -> None:
         """SampleOrbitInterior and ExpandRoadmaps: every constituent roadmap keeps growing."""
         for name in self.names:
-            self._add_interior(name, max(self.options.interior_samples, self.roadmaps[name].n_vertices // _GROWTH))
+            self._add_interior(name, max(self.options.interior_samples, int(_GROWTH * np.sqrt(self.roadmaps[name].n_vertices))))
 
     def _add_interior(self, name: str, n: int) -> None:
         """n samples; half uniform, half around known vertices, where passages matter most; free ones are kept."""
@@ -452,23 +467,25 @@ class Planner:
     def _adopt(self, plan: Plan) -> bool:
         """A checked plan that the tree does not have yet: into the tree, and under refinement."""
         better = self.incumbent.offer(plan, self._elapsed())
-        if self._uses("adoption"):
+        if self._found(plan) and self._uses("adoption"):
             self._graft(plan)
-        self._found(plan)
         return better
+
+    def _found(self, plan: Plan) -> bool:
+        """There is a plan: it is refined, and from now on the tree is rewired; whether it is a new one."""
+        new = not self._uses("refinement") or self.portfolio.add(plan)
+        # Skeletons that only lead to known plans are asked for ever more rarely.
+        self._stale = 0 if new else min(self._stale + 1, _RAREST)
+        self._skeletons_from = self.iteration + 2**self._stale
+        if self._uses("rewiring"):
+            self.growth.orbits.rewirings = _REWIRINGS
+        return new
 
     def _graft(self, plan: Plan) -> None:
         """Put a checked plan into the roadmaps and the tree; guidance follows its orbits from now on."""
         node = self.growth.adopt(plan.segments, plan.transitions, self.root)
         self._tree_cost = min(self._tree_cost, node.cost)
         self._path = list(dict.fromkeys(x.orbit for x in self.tree.branch(node)))
-
-    def _found(self, plan: Plan) -> None:
-        """There is a new plan: it is refined, and from now on the tree is rewired."""
-        if self._uses("refinement"):
-            self.portfolio.add(plan)
-        if self._uses("rewiring"):
-            self.growth.orbits.rewirings = _REWIRINGS
 
     # -- solutions ------------------------------------------------------------------------------------------------
 

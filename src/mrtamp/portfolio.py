@@ -32,6 +32,8 @@ _HOPELESS = 1.3
 """Plans that cost so many times the incumbent after their trial wait until nothing else is left to do."""
 _ROUNDS = 3
 """Times that a finished plan is shaken and refined again without gain before it is left alone."""
+_ALIKE = 0.02
+"""Relative difference of cost below which two plans with the same order of events are held to be alike."""
 WORTH_CHECKING = 0.002
 """Relative gain over the incumbent that is worth a check."""
 
@@ -88,13 +90,22 @@ class Portfolio:
         self.sliding = sliding
         self._entries: list[_Entry] = []
         self._settled: list[Plan] = []
+        self._seen: set[float] = set()
 
-    def add(self, plan: Plan) -> None:
-        """Put a checked plan under refinement; when there are too many, the dearest that is finished goes."""
+    def add(self, plan: Plan) -> bool:
+        """Put a checked plan under refinement; False if one like it is or was.
+
+        When there are too many the dearest goes, those that are finished first.
+        """
+        alike = [e for e in self._entries if _order(e.plan) == _order(plan)]
+        if round(plan.cost, 6) in self._seen or any(abs(e.cost - plan.cost) < _ALIKE * plan.cost for e in alike):
+            return False
+        self._seen.add(round(plan.cost, 6))
         self._entries.append(_Entry(plan))
         if len(self._entries) > SIZE:
             finished = [e for e in self._entries[:-1] if e.done] or self._entries[:-1]
             self._entries.remove(max(finished, key=lambda e: e.cost))
+        return True
 
     def improve(self, incumbent: float) -> Plan | None:
         """Give one plan its turn; a checked plan when it is clearly cheaper than `incumbent`."""
@@ -210,3 +221,7 @@ class Portfolio:
             self.rng,
             entry.resolution,
         )
+
+
+def _order(plan: Plan) -> tuple:
+    return tuple((a.kind, a.robots, a.object, a.subgoal) for t in plan.transitions for a in t.actions)

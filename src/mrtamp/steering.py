@@ -107,9 +107,20 @@ class Steering:
         return None
 
     def path(
-        self, mode: Mode, at: At, robot: str, goal: int, ignore: set[str] | None = None, rounds: int = ROUNDS
+        self,
+        mode: Mode,
+        at: At,
+        robot: str,
+        goal: int,
+        ignore: set[str] | None = None,
+        rounds: int = ROUNDS,
+        wild: float = 0.0,
     ) -> tuple[list[int] | None, Counter[str]]:
-        """Shortest valid path of one robot while the others stand, and how often each of those was in the way."""
+        """Shortest valid path of one robot while the others stand, and how often each of those was in the way.
+
+        `wild` is the share of roadmap edges that are taken to be closed, drawn anew every time; where that leaves no
+        path, all are open.
+        """
         roadmap = self.roadmaps[self.index[robot]]
         start = at[self.index[robot]]
         roadmap.offer_direct(start, goal)
@@ -132,6 +143,13 @@ class Steering:
             if self.validity.label((robot, mode.held.get(robot), other, v, mode.held.get(other))).hit:
                 blockers[other] += 1
         blocked = self.validity.blocked(robot, mode, standing)
+        if wild:
+            path = lazy_path(
+                roadmap, start, goal, blocked | (self.rng.random(len(blocked)) < wild), validate, rounds
+            )
+            if path is not None:
+                return path, blockers
+            blocked = self.validity.blocked(robot, mode, standing)
         path = lazy_path(roadmap, start, goal, blocked, validate, rounds)
         if path is None and not blockers and self._connects(roadmap, mode, start, goal):
             blocked = self.validity.blocked(robot, mode, standing)

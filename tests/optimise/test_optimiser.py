@@ -103,17 +103,18 @@ def pose(x: float, y: float) -> RigidTransform:
     return RigidTransform([x, y, HEIGHT])
 
 
-def test_a_disc_goes_around_a_wall_by_the_shortest_way(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("levels", "excess"), [(0, 0.008), (1, 0.005), (2, 0.0025)])
+def test_a_disc_goes_around_a_wall_by_the_shortest_way(tmp_path: Path, levels: int, excess: float) -> None:
     """Around the corner of a wall at a distance of its radius: two tangents and an arc between them."""
     wall = StaticBody("wall", RigidTransform([-1.0, 0, 0.05]), Shape("box", (2.0, 0.002, 0.1)))
     problem = discs(tmp_path, statics=(wall,), goal=(RobotAt("a", np.array([-0.5, 0.5])),))
     e = Errands(problem).move(a=(0.4, -0.5)).move(a=(0.4, 0.5)).move(a=(-0.5, 0.5))
-    scp = optimiser(e.plan())
-    run(scp)
+    scp = optimiser(e.plan(), levels=levels)
+    run(scp, 60)
     # The wall's end is at (0, 0), start and goal are on either side of the wall, an angle of 270 degrees apart.
     r, d = 0.2, np.hypot(0.5, 0.5)
     optimum = 2 * np.sqrt(d**2 - r**2) + r * (1.5 * np.pi - 2 * np.arccos(r / d))
-    assert 0.999 * optimum <= scp.cost / 1.01 <= 1.004 * optimum
+    assert optimum <= scp.cost / 1.01 <= (1 + excess) * optimum
     assert judged(scp).ok
 
 

@@ -15,14 +15,14 @@ from mrtamp.modes import object_poses
 from mrtamp.optimise import Optimiser
 from mrtamp.optimise.collisions import CollisionRows
 from mrtamp.optimise.fine import knot_samples
-from mrtamp.optimise.nearness import Near, Nearness
+from mrtamp.optimise.nearness import Near, Nearness, State
 from mrtamp.plan import Plan
 from mrtamp.transitions.families import grasp_families
 
 STEP = 1e-5
 
 
-def optimiser(plan: Plan, **keys: bool) -> Optimiser:
+def optimiser(plan: Plan, **keys) -> Optimiser:
     problem = plan.problem
     families = {
         (r.name, o.name): grasp_families(o, r.model.gripper.max_width) if r.model.gripper else []
@@ -63,17 +63,19 @@ def test_distance_rows_are_derivatives_of_drakes_distances(gantries: Optimiser) 
     q, c = turned(now, 0.03, rng)
     dq, dc = rng.normal(size=q.shape), 0.2 * rng.normal(size=c.shape)
 
+    def states(h: float, who: tuple[str, ...]) -> dict[str, State]:
+        modes = gantries.choices.at(c + h * dc).modes
+        return {r: nearness.state(r, (q + h * dq)[:, line.columns[r]], samples, modes) for r in who}
+
     def ask(h: float, who: tuple[str, ...]) -> Near:
-        arrangement = gantries.choices.at(c + h * dc)
-        knots = [(q + h * dq)[:, line.columns[r]] for r in who]
+        arrangement, at = gantries.choices.at(c + h * dc), states(h, who)
         if len(who) == 1:
-            return nearness.world(who[0], knots[0], samples, arrangement, 0.15)
-        return nearness.between(*who, *knots, samples, arrangement, 0.3)
+            return nearness.world(who[0], at[who[0]], samples, arrangement, 0.15)
+        return nearness.between((who[0], who[1]), (at[who[0]], at[who[1]]), samples, arrangement, 0.3)
 
     for who in (("left",), ("right",), ("left", "right")):
         near = ask(0.0, who)
-        knots = {r: q[:, line.columns[r]] for r in who}
-        A = gantries.collisions.gradient(line, samples, near, knots, gantries.choices.at(c))
+        A = gantries.collisions.gradient(line, samples, near, states(0.0, who), gantries.choices.at(c))
         slopes = dict(
             zip(
                 zip(near.sample.tolist(), near.a.tolist(), near.b.tolist(), strict=True),

@@ -11,7 +11,7 @@ from scipy import sparse
 from mrtamp.collision import PADDING
 from mrtamp.optimise.choices import Arrangement
 from mrtamp.optimise.fine import Violations, Who, contact_of, knot_samples
-from mrtamp.optimise.nearness import Near, Nearness, Samples
+from mrtamp.optimise.nearness import Near, Nearness, Samples, State
 from mrtamp.optimise.polyline import Polyline
 
 Demands = dict[Who, dict[tuple[int, float, int], int]]
@@ -37,17 +37,19 @@ _PARTS = 24
 class CollisionRows:
     """Linearised distances: A (P, K * N + coordinates), and how far (P,) each may shrink.
 
-    `deepest` is the largest penetration (m) beyond what is allowed.
+    `deepest` is the largest penetration (m) beyond what is allowed, `clearance` the least distance (K - 1, 3) at the
+    beginning, the middle and the end of every step, as far as it is less than what enters the program.
     """
 
     A: sparse.csr_array
     gap: np.ndarray
     deepest: float
+    clearance: dict[Who, np.ndarray]
 
     def joined(self, other: CollisionRows) -> CollisionRows:
         """These rows and others."""
         A = sparse.csr_array(sparse.vstack([self.A, other.A]))
-        return CollisionRows(A, np.concatenate([self.gap, other.gap]), max(self.deepest, other.deepest))
+        return CollisionRows(A, np.concatenate([self.gap, other.gap]), max(self.deepest, other.deepest), self.clearance)
 
 
 class Collisions:
@@ -92,15 +94,15 @@ class Collisions:
                 moved[who][k, round((at - k) * _PARTS) / _PARTS, segment] = strict
         self._demands = moved
 
-    def _samples(self, base: Samples, extra: Mapping[tuple[int, float, int], int]) -> tuple[Samples, np.ndarray]:
-        """The samples of a query and the clearance (S,) asked for at each."""
+    def _samples(self, n: int, extra: Mapping[tuple[int, float, int], int]) -> tuple[Samples, np.ndarray]:
+        """The samples demanded, and the clearance asked for at n common ones and at each of them."""
         least = _MARGIN / _FINER**self.level - _SHARE * self.tolerance
-        margin = np.full(len(base), least)
+        margin = np.full(n, least)
         if not extra:
-            return base, margin
+            return Samples.none(), margin
         lo, t, segment = (np.array(x) for x in zip(*extra, strict=True))
         strict = least + _STRICTER / _FINER**self.level * np.array(list(extra.values()))
-        return base.joined(Samples(lo, t, segment)), np.concatenate([margin, strict])
+        return Samples(lo, t, segment), np.concatenate([margin, strict])
 
     # -- rows -------------------------------------------------------------------------------------------------------
 
@@ -118,27 +120,34 @@ class Collisions:
         blocks: list[sparse.csr_array] = [sparse.csr_array((0, q.size + len(arrangement.c)))]
         gaps: list[np.ndarray] = [np.zeros(0)]
         deepest = 0.0
-        names = list(line.columns)
+        clearance: dict[Who, np.ndarray] = {}
+        names, ask = list(line.columns), self.nearness
+        knots = {r: q[:, c] for r, c in line.columns.items()}
+        common = {r: ask.state(r, knots[r], base, arrangement.modes) for r in names}
         for i, robot in enumerate(names):
             for other in (None, *names[:i]):
                 who: Who = (robot,) if other is None else (other, robot)
-                samples, margin = self._samples(base, demands.get(who, {}))
-                if not len(samples):
-                    continue
-                knots = {r: q[:, line.columns[r]] for r in who}
+                extra, margin = self._samples(len(base), demands.get(who, {}))
+                samples, states = base, {r: common[r] for r in who}
+                if len(extra):
+                    samples = base.joined(extra)
+                    more = {r: ask.state(r, knots[r], extra, arrangement.modes) for r in who}
+                    states = {r: common[r].joined(more[r]) for r in who}
                 if other is None:
-                    near = self.nearness.world(robot, knots[robot], samples, arrangement, _NEAR)
+                    near = ask.world(robot, states[robot], samples, arrangement, _NEAR)
                     asked = np.where(self._touching(line, robot, samples, near), _TOUCHING, margin[near.sample])
                 else:
-                    near = self.nearness.between(other, robot, knots[other], knots[robot], samples, arrangement, _NEAR)
+                    pair = (states[other], states[robot])
+                    near = ask.between((other, robot), pair, samples, arrangement, _NEAR)
                     asked = margin[near.sample]
+                clearance[who] = _clearance(line, base, near)
                 if len(near.distance):
                     # Where robots stand, their shapes count without padding.
                     allowed = np.minimum(asked, 0) - (0.0 if other is None else 2 * PADDING)
                     deepest = max(deepest, float((allowed - near.distance).max()) - self.tolerance)
-                    blocks.append(self.gradient(line, samples, near, knots, arrangement))
+                    blocks.append(self.gradient(line, samples, near, states, arrangement))
                     gaps.append(near.distance - asked)
-        return CollisionRows(sparse.csr_array(sparse.vstack(blocks)), np.concatenate(gaps), deepest)
+        return CollisionRows(sparse.csr_array(sparse.vstack(blocks)), np.concatenate(gaps), deepest, clearance)
 
     def _touching(self, line: Polyline, robot: str, samples: Samples, near: Near) -> np.ndarray:
         """Pairs (P,) of a load and what it is being lifted off or put on."""
@@ -152,23 +161,22 @@ class Collisions:
         return ((near.a == held) & (near.b == support)) | ((near.b == held) & (near.a == support))
 
     def gradient(
-        self, line: Polyline, samples: Samples, near: Near, knots: Mapping[str, np.ndarray], arrangement: Arrangement
+        self, line: Polyline, samples: Samples, near: Near, states: Mapping[str, State], arrangement: Arrangement
     ) -> sparse.csr_array:
         """Rows over flattened knots and coordinates: a row between two knots involves both."""
         N = line.q.shape[1]
         lo, t = samples.lo[near.sample], samples.t[near.sample]
         P = len(lo)
         values, rows, columns = [], [], []
-        x = {r: samples.at(k) for r, k in knots.items()}
-        for robot in knots:
-            G = self.nearness.joint_gradient(robot, x[robot], near)
+        for robot, state in states.items():
+            G = self.nearness.joint_gradient(robot, state, near)
             cols = line.columns[robot]
             joint = np.arange(cols.start, cols.stop)
             for knot, weight in ((lo, 1 - t), (np.minimum(lo + 1, line.knots - 1), t)):
                 values.append((G * weight[:, None]).reshape(-1))
                 rows.append(np.repeat(np.arange(P), len(joint)))
                 columns.append((knot[:, None] * N + joint).reshape(-1))
-        H = self.nearness.choice_gradient(near, samples, x, arrangement)
+        H = self.nearness.choice_gradient(near, samples, states, arrangement)
         r, k = np.nonzero(H)
         values.append(H[r, k])
         rows.append(r)
@@ -177,3 +185,19 @@ class Collisions:
         out = sparse.csr_array(entries, shape=(P, line.q.size + len(arrangement.c)))
         out.eliminate_zeros()
         return out
+
+
+def _clearance(line: Polyline, base: Samples, near: Near) -> np.ndarray:
+    """Least distances (K - 1, 3) at the beginning, the middle and the end of every step, at most _NEAR."""
+    least = np.full(len(base), _NEAR)
+    mine = near.sample < len(base)
+    np.minimum.at(least, near.sample[mine], near.distance[mine])
+    out = np.full((line.knots - 1, 3), _NEAR)
+    own = base.segment == line.segment_of_step[base.lo] if len(base) else np.zeros(0, dtype=bool)
+    place = np.round(2 * base.t).astype(int)
+    np.minimum.at(out, (base.lo[own], place[own]), least[own])
+    # The end of a step is the beginning of the next, but where a transition happens in between.
+    of_step = line.segment_of_step
+    same = np.flatnonzero(of_step[1:] == of_step[:-1])
+    out[same, 2] = out[same + 1, 0]
+    return out

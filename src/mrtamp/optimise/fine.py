@@ -13,6 +13,8 @@ from mrtamp.optimise.nearness import CULL, Nearness, Samples
 from mrtamp.optimise.polyline import Polyline, Stretch
 
 _SLIVER = 1e-9
+_SWERVE = 1.3
+"""By how much more than tracked points any other may move."""
 
 Who = tuple[str, ...]
 """One robot (with its load against the world), or two (against each other)."""
@@ -47,21 +49,25 @@ class FineCheck:
         self.nearness = nearness
         self.resolution = resolution
 
-    def samples(self, line: Polyline, q: np.ndarray, between: bool = False) -> Samples:
+    def _travel(self, line: Polyline, q: np.ndarray) -> dict[str, np.ndarray]:
+        """How far (m) tracked points of every robot move in every step (K - 1,)."""
+        out = {}
+        for robot, columns in line.columns.items():
+            world = self.nearness.worlds[robot]
+            x = q[:, columns]
+            R, p = world.tool.pose(x)
+            hand = p[:, None] + np.einsum("nij,kj->nki", R, 0.1 * np.eye(3))
+            points = np.concatenate([world.bounds.spheres(x), hand], axis=1)
+            out[robot] = np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1)
+        return out
+
+    def _samples(self, line: Polyline, travel: Mapping[str, np.ndarray], between: bool) -> Samples:
         """Samples between which no tracked point of any robot moves further than the resolution, transitions twice.
 
         With `between`, the samples in the middle of those.
         """
-        travel = np.zeros(line.knots - 1)
-        for robot, columns in line.columns.items():
-            world = self.nearness.worlds[robot]
-            x = q[:, columns]
-            own = world.bounds.spheres(x)
-            R, p = world.tool.pose(x)
-            hand = p[:, None] + np.einsum("nij,kj->nki", R, 0.1 * np.eye(3))
-            for points in (own, hand):
-                travel = np.maximum(travel, np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1))
-        pieces = np.maximum(1, np.ceil(1.1 * travel / self.resolution)).astype(int)
+        furthest = np.max(list(travel.values()), axis=0)
+        pieces = np.maximum(1, np.ceil(1.1 * furthest / self.resolution)).astype(int)
         if not between:
             return knot_samples(line, pieces)
         lo = np.repeat(np.arange(line.knots - 1), pieces)
@@ -74,26 +80,34 @@ class FineCheck:
         q: np.ndarray,
         arrangement: Arrangement,
         pinned: Mapping[str, np.ndarray],
+        clearance: Mapping[Who, np.ndarray],
         between: bool = False,
     ) -> list[Violations]:
         """All samples in collision; with `between`, of the samples in the middle of the others.
 
-        Next to knots (K,) at which both of two robots are `pinned`, their shapes count without padding.
+        Next to knots (K,) at which both of two robots are `pinned`, their shapes count without padding.  `clearance`
+        are distances (K - 1, 3) at the beginning, the middle and the end of every step: nothing that is further apart
+        at both ends of half a step than it moves in between is asked about.
         """
-        samples = self.samples(line, q, between)
+        travel = self._travel(line, q)
+        samples = self._samples(line, travel, between)
         names = list(line.columns)
-        x = {r: samples.at(q[:, line.columns[r]]) for r in names}
-        spheres = {r: self.nearness.spheres(r, x[r], arrangement.modes, samples.segment) for r in names}
         out = []
         for i, robot in enumerate(names):
-            hits = self._world(line, robot, x[robot], samples, arrangement, spheres[robot])
-            if len(hits):
-                out.append(Violations((robot,), samples[hits]))
-            for other in names[:i]:
-                tight = pinned[other] & pinned[robot]
-                hits = self._pair(other, robot, x, samples, arrangement, spheres, tight)
+            for other in (None, *names[:i]):
+                who: Who = (robot,) if other is None else (other, robot)
+                moved = np.sum([travel[r] for r in who], axis=0)
+                mine = samples[_doubtful(line, samples, clearance[who], moved)]
+                if not len(mine):
+                    continue
+                x = {r: mine.at(q[:, line.columns[r]]) for r in who}
+                spheres = {r: self.nearness.spheres(r, x[r], arrangement.modes, mine.segment) for r in who}
+                if other is None:
+                    hits = self._world(line, robot, x[robot], mine, arrangement, spheres[robot])
+                else:
+                    hits = self._pair(other, robot, x, mine, arrangement, spheres, pinned[other] & pinned[robot])
                 if len(hits):
-                    out.append(Violations((other, robot), samples[hits]))
+                    out.append(Violations(who, mine[hits]))
         return out
 
     def _world(
@@ -150,6 +164,14 @@ class FineCheck:
 
             hits += i[_all_hits(ask, np.arange(len(i)))].tolist()
         return np.array(sorted(hits), dtype=int)
+
+
+def _doubtful(line: Polyline, samples: Samples, clearance: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Samples that the distances at the ends of their half of a step do not settle."""
+    half = (samples.t > 0.5).astype(int)
+    apart = clearance[samples.lo, half] + clearance[samples.lo, half + 1]
+    own = samples.segment == line.segment_of_step[samples.lo]
+    return np.flatnonzero(~own | (apart <= _SWERVE * moved[samples.lo] / 2))
 
 
 def _all_hits(first_hit: Callable[[np.ndarray], int], rows: np.ndarray) -> np.ndarray:

@@ -148,6 +148,21 @@ def _ask(
     return Near(np.array(sample, dtype=int), np.array(distance), wrench, np.array(a, dtype=int), np.array(b, dtype=int))
 
 
+@dataclass(frozen=True, eq=False)
+class State:
+    """A robot at samples: configurations x (S, n), bounding spheres with its load, screws (S, n, 6) of its joints."""
+
+    x: np.ndarray
+    centres: np.ndarray
+    radii: np.ndarray
+    screws: np.ndarray
+
+    def joined(self, other: State) -> State:
+        """At these samples and others."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return State(*(np.concatenate(pair) for pair in pairs))
+
+
 class Nearness:
     """Asks the planner's plants what is near, and turns the answers into gradients."""
 
@@ -178,6 +193,12 @@ class Nearness:
         radii = np.tile(world.bounds.radii, (len(q), 1))
         return np.concatenate([centres, load], axis=1), np.concatenate([radii, size], axis=1)
 
+    def state(self, robot: str, q: np.ndarray, samples: Samples, modes: Sequence[Mode]) -> State:
+        """A robot with knots q (K, n) at samples of a motion through `modes`."""
+        x = samples.at(q)
+        centres, radii = self.spheres(robot, x, modes, samples.segment)
+        return State(x, centres, radii, joint_screws(self.worlds[robot].chain, x))
+
     def rows(
         self,
         robot: str,
@@ -200,20 +221,15 @@ class Nearness:
                 rows[near, k : k + 7] = one[k : k + 7]
         return rows
 
-    def world(self, robot: str, q: np.ndarray, samples: Samples, arrangement: Arrangement, reach: float) -> Near:
-        """What is within `reach` (m) of a robot and its load: itself, the static world, objects at rest.
-
-        q (K, n) are the robot's knots.
-        """
+    def world(self, robot: str, state: State, samples: Samples, arrangement: Arrangement, reach: float) -> Near:
+        """What is within `reach` (m) of a robot and its load: itself, the static world, objects at rest."""
         world = self.worlds[robot]
-        x = samples.at(q)
-        centres, radii = self.spheres(robot, x, arrangement.modes, samples.segment)
         parts = []
         for s in np.unique(samples.segment).tolist():
             i = np.flatnonzero(samples.segment == s)
             mode = arrangement.modes[s]
-            poses = arrangement.resting(mode)
-            rows = self.rows(robot, x[i], mode.held.get(robot), poses, (centres[i], radii[i]), reach)
+            spheres = (state.centres[i], state.radii[i])
+            rows = self.rows(robot, state.x[i], mode.held.get(robot), arrangement.resting(mode), spheres, reach)
             parts.append(_ask(world.scene.plant, world.context, rows, self._carrier(world.scene), reach, i))
         return _joined(parts)
 
@@ -242,32 +258,34 @@ class Nearness:
         return rows
 
     def between(
-        self, a: str, b: str, qa: np.ndarray, qb: np.ndarray, samples: Samples, arrangement: Arrangement, reach: float
+        self,
+        robots: tuple[str, str],
+        states: tuple[State, State],
+        samples: Samples,
+        arrangement: Arrangement,
+        reach: float,
     ) -> Near:
-        """What is within `reach` (m) between two robots and their loads; qa, qb are their knots."""
-        xa, xb = samples.at(qa), samples.at(qb)
-        modes = arrangement.modes
-        spheres = tuple(self.spheres(r, x, modes, samples.segment) for r, x in ((a, xa), (b, xb)))
-        close = self.close((spheres[0], spheres[1]), reach)
-        pair, _ = self.collision.pair(a, b)
+        """What is within `reach` (m) between two robots and their loads."""
+        a, b = states
+        close = self.close(((a.centres, a.radii), (b.centres, b.radii)), reach)
+        pair, _ = self.collision.pair(*robots)
         parts = []
         for s in np.unique(samples.segment[close]).tolist():
             i = close[samples.segment[close] == s]
-            rows = self.pair_rows(a, b, xa[i], xb[i], modes[s])
+            rows = self.pair_rows(*robots, a.x[i], b.x[i], arrangement.modes[s])
             parts.append(_ask(pair.scene.plant, pair.context, rows, self._carrier(pair.scene), reach, i))
         return _joined(parts)
 
-    def joint_gradient(self, robot: str, q: np.ndarray, near: Near) -> np.ndarray:
-        """Change of the distances (P, n) with the configurations of a robot, q (S, n) at the samples."""
+    def joint_gradient(self, robot: str, state: State, near: Near) -> np.ndarray:
+        """Change of the distances (P, n) with the configurations of a robot."""
         table = self.carriers.moves[robot]
         direction = table[near.a] - table[near.b]
-        screws = joint_screws(self.worlds[robot].chain, q)[near.sample]
-        return direction * (screws @ near.wrench[:, :, None])[..., 0]
+        return direction * (state.screws[near.sample] @ near.wrench[:, :, None])[..., 0]
 
     def choice_gradient(
-        self, near: Near, samples: Samples, x: Mapping[str, np.ndarray], arrangement: Arrangement
+        self, near: Near, samples: Samples, states: Mapping[str, State], arrangement: Arrangement
     ) -> np.ndarray:
-        """Change of the distances (P, count) with all coordinates; x: robot -> configurations (S, n)."""
+        """Change of the distances (P, count) with all coordinates."""
         out = np.zeros((len(near.distance), len(arrangement.c)))
         if not out.size:
             return out
@@ -278,7 +296,7 @@ class Nearness:
             here = segment == s
             for a in mode.attachments:
                 key = ("held", a.parent) if a.held else ("object", a.object)
-                if a.held and a.parent not in x:
+                if a.held and a.parent not in states:
                     continue
                 sign = (near.a == number[key]).astype(float) - (near.b == number[key])
                 rows = np.flatnonzero(here & (sign != 0))
@@ -288,7 +306,7 @@ class Nearness:
                     slide = arrangement.slide(a)
                     if slide is None:
                         continue
-                    X_WG = self.worlds[a.parent].tool.matrix(x[a.parent][near.sample[rows]])
+                    X_WG = self.worlds[a.parent].tool.matrix(states[a.parent].x[near.sample[rows]])
                     moved = [(slide.columns, transported(arrangement.own_screws(a), X_WG))]
                 else:
                     moved = arrangement.world_screws(mode.chain(a.object))

@@ -38,9 +38,9 @@ _SHALLOW = 1e-3
 _TRUE, _FALSE = 0.7, 0.25
 _STALL = 1e-3
 _PATIENCE = 6
-_CHANCE, _WORTH = 6, 3e-4
-"""Steps after which a finer polyline has to have gained that share."""
 _EPS = 1e-9
+_WINDOW, _WORTH, _FINER = 8, 2e-3, 4.0
+"""Steps within which the best cost and the current merit have to fall by that share; by how much less when finer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,8 @@ class Optimiser:
         self.trust = TRUST
         self.converged = False
         self._stalls = 0
-        self._refined = (0, np.inf)
+        self._trail: list[float] = []
+        self._worth = np.inf
         self._promise = 0.0
         self.collisions = Collisions(self.nearness, problem.collision.tolerance)
         self._changes = sum(self.weights.transitions.get(a.kind, 0.0) for t in transitions for a in t.actions)
@@ -133,7 +134,7 @@ class Optimiser:
         """The judge refused the best iterate: ask for more clearance where it collided, and go on from there."""
         refused = self._best
         self._best, self.converged, self._stalls = self._sure, False, 0
-        self._refined = (self.steps, np.inf)
+        self._trail.clear()
         self.trust = max(self.trust, 4 * _SMALLEST)
         self._return_to(refused)
         bounds = [0, *refused.line.events.tolist()]
@@ -192,13 +193,13 @@ class Optimiser:
             return self._reject()
         clean = rows.deepest < _SHALLOW
         if clean:
-            violations = self._violations(candidate)
+            violations = self._violations(candidate, rows)
             clean = not violations
             if violations:
                 rows = rows.joined(self.collisions.more(*where, self.collisions.learn(violations)))
         before = self._merit(now, self._rows)
         after = self._merit(candidate, rows)
-        self._now, self._rows = candidate, rows
+        self._now, self._rows, self._worth = candidate, rows, after
         gain = 0.0
         if clean and candidate.cost < self._best.cost - _EPS:
             gain = self._best.cost - candidate.cost
@@ -221,15 +222,17 @@ class Optimiser:
         self._settle(self.trust < _SMALLEST or self._stalls >= _PATIENCE)
 
     def _settle(self, done: bool) -> None:
-        """Where the polyline has converged, go on with finer steps beside its bends, unless that gains nothing."""
-        since, cost = self._refined
-        if self.collisions.level > 0 and self.steps - since >= _CHANCE:
-            done = done or self._best.cost > (1 - _WORTH) * cost
-        if done and self.collisions.level < self.levels:
+        """Where the polyline has converged, go on with finer steps beside its bends."""
+        level = self.collisions.level
+        self._trail.append(self._best.cost + self._worth)
+        if len(self._trail) > _WINDOW:
+            first, last = self._trail[-_WINDOW - 1], self._trail[-1]
+            done = done or first - last < _WORTH / _FINER**level * last
+        if done and level < self.levels:
             self.collisions.level += 1
             self.collisions.forget()
-            self._refined = (self.steps, self._best.cost)
             self._stalls, self.trust = 0, TRUST / 2**self.collisions.level
+            self._trail.clear()
             self._return_to(self._best)
             self._resample()
         else:
@@ -240,12 +243,12 @@ class Optimiser:
         self._settle(self.trust < _SMALLEST)
         return 0.0
 
-    def _violations(self, x: Iterate) -> list[Violations]:
+    def _violations(self, x: Iterate, rows: CollisionRows) -> list[Violations]:
         """Samples in collision; what may become the best is looked at twice as closely."""
-        found = self.fine.violations(x.line, x.q, x.arrangement, self._pinned)
+        found = self.fine.violations(x.line, x.q, x.arrangement, self._pinned, rows.clearance)
         if found or x.cost >= self._best.cost - _EPS:
             return found
-        return self.fine.violations(x.line, x.q, x.arrangement, self._pinned, between=True)
+        return self.fine.violations(x.line, x.q, x.arrangement, self._pinned, rows.clearance, between=True)
 
     def _merit(self, x: Iterate, rows: CollisionRows) -> float:
         return x.cost + PENALTY * float(np.maximum(-rows.gap, 0.0).sum())
