@@ -1,7 +1,8 @@
 """The command line: list, plan, check, view, show, bench.
 
-Exit codes: 0 a plan was found and checked (or the check passed), 1 no plan within the budget (or the check failed),
-2 bad input.  Everything that takes long to import is imported inside the command that needs it.
+Exit codes: 0 a plan was found and checked (or the check passed, or every aim of a suite was met), 1 no plan within the
+budget (or the check failed, or an aim was missed), 2 bad input.  What takes long to import is imported inside the
+command that needs it.
 """
 
 from __future__ import annotations
@@ -369,7 +370,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="mrtamp",
         description="Plan what several robot arms do together: who handles what, when, and every motion.",
-        epilog="Exit codes: 0 found and checked, 1 no plan or a failed check, 2 bad input.",
+        epilog="Exit codes: 0 found and checked, 1 no plan, a failed check or a missed aim, 2 bad input.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -23,8 +23,6 @@ from mrtamp.validity import Validity
 
 _DEPTH = 2
 """How many robots may have to move for one another in a chain."""
-_WILD = 0.25
-"""Share of the edges that are closed, at random, where a leg is to take another way."""
 _ASIDE = 6
 """Random vertices offered to a robot that is in the way."""
 
@@ -252,8 +250,8 @@ class Insertion:
     def _leg(self, state: _State, robot: str, v: int) -> Leg | None:
         at = tuple(state.at[r] for r in self.names)
         others = {r for r in self.names if r != robot}
-        wild = _WILD if self.rng.random() < self._variety else 0.0
-        path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, wild=wild)
+        detour = self.rng.random() < self._variety
+        path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, detour=detour)
         if path is None:
             return None
         rows = [state.time.at[robot]]

@@ -25,7 +25,7 @@ from mrtamp.plan import Plan, Transition
 from mrtamp.portfolio import Portfolio
 from mrtamp.problem import MrtampError, Problem
 from mrtamp.roadmap import Roadmap
-from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
+from mrtamp.skeleton_guidance import SkeletonGuidance
 from mrtamp.tensor_tree import Node
 from mrtamp.transitions.candidate import Candidate
 from mrtamp.transitions.projection import uniform_configurations
@@ -55,6 +55,8 @@ _RAREST = 7
 """Binary logarithm of the longest pause, in iterations, between attempts at skeletons that lead to nothing new."""
 _REWIRINGS = 6
 """Steps that may be validated for rewiring per insertion, once there is a plan."""
+_QUICK, _THOROUGH = 30, 300
+"""Orders evaluated per search for skeletons, before there is a plan and later."""
 _HOPE = 1.0
 """Skeletons are realised while their estimate is less than the incumbent's cost times this."""
 _TIE = 0.25
@@ -333,7 +335,8 @@ class Planner:
     def _expand_roadmaps(self, orbit: int) -> None:
         """SampleOrbitInterior and ExpandRoadmaps: every constituent roadmap keeps growing."""
         for name in self.names:
-            self._add_interior(name, max(self.options.interior_samples, int(_GROWTH * np.sqrt(self.roadmaps[name].n_vertices))))
+            grown = int(_GROWTH * np.sqrt(self.roadmaps[name].n_vertices))
+            self._add_interior(name, max(self.options.interior_samples, grown))
 
     def _add_interior(self, name: str, n: int) -> None:
         """n samples; half uniform, half around known vertices, where passages matter most; free ones are kept."""
@@ -449,19 +452,28 @@ class Planner:
             self._expand_roadmaps(0)
         self.skeletons.grow(*(_FIRST_WAYS if first else _MORE_WAYS))
         self.skeletons.update_bound()
-        for _ in range(_REALISATIONS):
-            proposal: Proposal | None = next(self.skeletons.propose(_HOPE * self._cost()), None)
-            if proposal is None:
+        tries = 0
+        while tries < _REALISATIONS:
+            failed: set[int] = set()
+            for proposal in self.skeletons.propose(_HOPE * self._cost(), _QUICK if first else _THOROUGH):
+                if failed & {id(way) for _, way in proposal.stops}:
+                    # The guidance has learnt something about these since.
+                    continue
+                tries += 1
+                timed = self.growth.insert(proposal, self.skeletons, self.root)
+                plan = None if timed is None else self.incumbent.accepted(*timed)
+                if plan is not None:
+                    self.skeletons.realised(proposal)
+                    return self._adopt(plan)
+                node = self.growth.realise(proposal, self.skeletons, self.root)
+                if node is not None:
+                    self.skeletons.realised(proposal)
+                    return self._solution(node)
+                failed = {id(way) for _, way in proposal.stops if way.failures}
+                if tries >= _REALISATIONS:
+                    return False
+            if not failed:
                 return False
-            timed = self.growth.insert(proposal, self.skeletons, self.root)
-            plan = None if timed is None else self.incumbent.accepted(*timed)
-            if plan is not None:
-                self.skeletons.realised(proposal)
-                return self._adopt(plan)
-            node = self.growth.realise(proposal, self.skeletons, self.root)
-            if node is not None:
-                self.skeletons.realised(proposal)
-                return self._solution(node)
         return False
 
     def _adopt(self, plan: Plan) -> bool:

@@ -78,8 +78,10 @@ class SkeletonGuidance:
         self._lengths: dict[tuple[str, int, int], tuple[int, float]] = {}
         self._reaching: dict[tuple[str, int], Way] = {}
         self.items = self._in_order([o for o in root.of if not guidance.done(root, o)])
-        # A goal that ends with an object in a hand is the search's business.
-        self.applies = not any(isinstance(c, HeldBy) for c in problem.goal) and bool(self.items or problem.subgoals)
+        # A goal that ends with an object in a hand, or an object that subgoals lead as well, is the search's business.
+        led = {s.attach.object for s in problem.subgoals if s.attach is not None}
+        held = any(isinstance(c, HeldBy) for c in problem.goal)
+        self.applies = not held and not led & set(self.items) and bool(self.items or problem.subgoals)
         self.robots = [r.name for r in problem.robots if r.model.gripper is not None]
 
     def _in_order(self, items: list[str]) -> list[str]:
@@ -188,8 +190,11 @@ class SkeletonGuidance:
 
     # -- proposals ------------------------------------------------------------------------------------------------
 
-    def propose(self, below: float = np.inf) -> Iterator[Proposal]:
-        """Skeletons whose estimate is less than `below`, cheapest first, those realised before held back a little."""
+    def propose(self, below: float = np.inf, effort: int = 300) -> Iterator[Proposal]:
+        """Skeletons whose estimate is less than `below`, cheapest first, those realised before held back a little.
+
+        `effort` bounds the search among orders where they are too many for exact methods.
+        """
         sets = self._options()
         if sets is None or not self.applies:
             return
@@ -204,6 +209,7 @@ class SkeletonGuidance:
             limit=_LIMIT,
             rng=self.rng,
             distance=self._distance(sets),
+            effort=effort,
         )
         found.sort(key=lambda x: x.cost * (1 + _REPEATED * self._realised[x.order]))
         for skeleton in found:
@@ -304,6 +310,9 @@ class SkeletonGuidance:
         if stop.kind == "reach":
             assert stop.subgoal is not None and stop.at is not None
             return self.sampler.reaching.candidate(mode, self.problem.subgoal(stop.subgoal), stop.at)
+        assert stop.before is not None
+        if mode.of[stop.before.object] is not stop.before:
+            return None
         if stop.candidate is None:
             stop.candidate = self._register(stop, mode)
         return stop.candidate

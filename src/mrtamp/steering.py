@@ -28,6 +28,8 @@ _ASIDE_ROUNDS = 8
 
 _SEARCHES, _TREE = 4, 40
 """How often a way that the roadmap lacks is looked for between two vertices, and tree extensions, doubled each time."""
+_DETOUR = 1.0
+"""How much longer than the shortest path one past a random vertex may be, relative to it."""
 Insert = Callable[[Node, At], Node]
 
 
@@ -114,12 +116,12 @@ class Steering:
         goal: int,
         ignore: set[str] | None = None,
         rounds: int = ROUNDS,
-        wild: float = 0.0,
+        detour: bool = False,
     ) -> tuple[list[int] | None, Counter[str]]:
         """Shortest valid path of one robot while the others stand, and how often each of those was in the way.
 
-        `wild` is the share of roadmap edges that are taken to be closed, drawn anew every time; where that leaves no
-        path, all are open.
+        `detour` asks for a path past a random vertex that is not far out of the way, where there is one: other ways
+        around things become plans too.
         """
         roadmap = self.roadmaps[self.index[robot]]
         start = at[self.index[robot]]
@@ -143,10 +145,8 @@ class Steering:
             if self.validity.label((robot, mode.held.get(robot), other, v, mode.held.get(other))).hit:
                 blockers[other] += 1
         blocked = self.validity.blocked(robot, mode, standing)
-        if wild:
-            path = lazy_path(
-                roadmap, start, goal, blocked | (self.rng.random(len(blocked)) < wild), validate, rounds
-            )
+        if detour:
+            path = self._past(roadmap, start, goal, blocked, validate, rounds)
             if path is not None:
                 return path, blockers
             blocked = self.validity.blocked(robot, mode, standing)
@@ -155,6 +155,27 @@ class Steering:
             blocked = self.validity.blocked(robot, mode, standing)
             path = lazy_path(roadmap, start, goal, blocked, validate, rounds)
         return path, blockers
+
+    def _past(
+        self,
+        roadmap: Roadmap,
+        start: int,
+        goal: int,
+        blocked: np.ndarray,
+        validate: Callable[[int], bool],
+        rounds: int,
+    ) -> list[int] | None:
+        there, back = (roadmap.distances_to(v, blocked) for v in (start, goal))
+        vertices = np.array(roadmap.open_vertices())
+        through = (there + back)[vertices]
+        near = vertices[through <= (1 + self.rng.uniform(0, _DETOUR)) * there[goal] + 1e-9]
+        near = near[(near != start) & (near != goal)]
+        if not len(near):
+            return None
+        w = int(near[self.rng.integers(len(near))])
+        one = lazy_path(roadmap, start, w, blocked, validate, rounds)
+        two = lazy_path(roadmap, w, goal, blocked, validate, rounds) if one is not None else None
+        return None if one is None or two is None else [*one, *two[1:]]
 
     def _connects(self, roadmap: Roadmap, mode: Mode, start: int, goal: int) -> bool:
         """The roadmap has no way where no other robot is to blame: look for one, harder each time, and not for ever."""

@@ -24,7 +24,7 @@ _MARGIN = 1.5e-3
 _STRICTER = 1e-3
 """Additional clearance (m) for every time that a sample was in collision."""
 _FINER = 3.0
-"""By how much both are less at every finer level."""
+"""By how much the clearance is less at every finer level."""
 _TOUCHING = -3e-4
 """Clearance (m) asked of an object and what it is lifted off or put on."""
 _SHARE = 0.25
@@ -80,7 +80,7 @@ class Collisions:
         """Ask for more clearance at one place, where the penetration was `depth` (m)."""
         rows = self._demands.setdefault(who, {})
         key = (lo, round(t * _PARTS) / _PARTS, segment)
-        rows[key] = rows.get(key, 0) + 1 + int(np.ceil(depth / _STRICTER * _FINER**self.level))
+        rows[key] = rows.get(key, 0) + 1 + int(np.ceil(depth / _STRICTER))
         return key
 
     def move(self, u: np.ndarray) -> None:
@@ -101,7 +101,7 @@ class Collisions:
         if not extra:
             return Samples.none(), margin
         lo, t, segment = (np.array(x) for x in zip(*extra, strict=True))
-        strict = least + _STRICTER / _FINER**self.level * np.array(list(extra.values()))
+        strict = least + _STRICTER * np.array(list(extra.values()))
         return Samples(lo, t, segment), np.concatenate([margin, strict])
 
     # -- rows -------------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from mrtamp.optimise.nearness import CULL, Nearness, Samples
 from mrtamp.optimise.polyline import Polyline, Stretch
 
 _SLIVER = 1e-9
+_QUARTERS = np.array([0.25, 0.5, 0.75])
 _SWERVE = 1.3
 """By how much more than tracked points any other may move."""
 
@@ -64,14 +65,14 @@ class FineCheck:
     def _samples(self, line: Polyline, travel: Mapping[str, np.ndarray], between: bool) -> Samples:
         """Samples between which no tracked point of any robot moves further than the resolution, transitions twice.
 
-        With `between`, the samples in the middle of those.
+        With `between`, three samples in between any two of those.
         """
         furthest = np.max(list(travel.values()), axis=0)
         pieces = np.maximum(1, np.ceil(1.1 * furthest / self.resolution)).astype(int)
         if not between:
             return knot_samples(line, pieces)
-        lo = np.repeat(np.arange(line.knots - 1), pieces)
-        t = np.concatenate([np.zeros(0), *((np.arange(n) + 0.5) / n for n in pieces.tolist())])
+        lo = np.repeat(np.arange(line.knots - 1), 3 * pieces)
+        t = np.concatenate([np.zeros(0), *(((np.arange(n)[:, None] + _QUARTERS) / n).ravel() for n in pieces.tolist())])
         return Samples(lo, t, line.segment_of_step[lo])
 
     def violations(
@@ -83,7 +84,7 @@ class FineCheck:
         clearance: Mapping[Who, np.ndarray],
         between: bool = False,
     ) -> list[Violations]:
-        """All samples in collision; with `between`, of the samples in the middle of the others.
+        """All samples in collision; with `between`, of the samples in between the others.
 
         Next to knots (K,) at which both of two robots are `pinned`, their shapes count without padding.  `clearance`
         are distances (K - 1, 3) at the beginning, the middle and the end of every step: nothing that is further apart

@@ -244,7 +244,7 @@ class Optimiser:
         return 0.0
 
     def _violations(self, x: Iterate, rows: CollisionRows) -> list[Violations]:
-        """Samples in collision; what may become the best is looked at twice as closely."""
+        """Samples in collision; what may become the best is looked at four times as closely."""
         found = self.fine.violations(x.line, x.q, x.arrangement, self._pinned, rows.clearance)
         if found or x.cost >= self._best.cost - _EPS:
             return found

@@ -22,6 +22,8 @@ from mrtamp.transitions.sampler import TransitionSampler
 
 _PLACES = 3
 """Places drawn per grasp."""
+_AFTER = 24
+"""Places drawn after a handover: those are dear, so each is followed up."""
 _CHECKED = 0.6
 """Share of the solved ways, shortest first for the most part, that are checked for collisions."""
 BLOCKED = 1.5
@@ -197,9 +199,12 @@ class Ways:
         sampler = self.sampler
         key = (item, (giver, receiver))
         self.tries[key] = self.tries.get(key, 0) + 1
-        if not self._goal_places(mode, item, chains):
+        start = sampler.validity.world_pose(mode.chain(item))[:3, 3]
+        goals = self._goal_places(mode, item, chains)
+        if not goals or not self._near(receiver, goals) or not sampler.in_reach(giver, start):
             return []
         picks = sampler.picks(mode, giver, item) or sampler.sample_pick(mode, giver, item, n)
+        picks = [p for p in picks if p.promising] or picks
         out: list[Way] = []
         for pick in [picks[int(i)] for i in self.rng.permutation(len(picks))[:2]]:
             held = mode.replace(*([pick.after] if pick.after else []))
@@ -208,7 +213,7 @@ class Ways:
                 taken = handover.after
                 places = self._goal_places(mode, item, chains)
                 qb = sampler.roadmaps[receiver].q[handover.at[receiver]]
-                m = 2 * _PLACES
+                m = _AFTER
                 q2, which, poses, solved = self._places(receiver, [taken] * m, np.tile(qb, (m, 1)), places)
                 found = 0
                 for k in np.flatnonzero(solved)[np.argsort(np.linalg.norm(q2[solved] - qb, axis=1))].tolist():
