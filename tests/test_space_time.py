@@ -121,7 +121,7 @@ def test_schedules_of_random_legs_are_free_of_collisions(tmp_path: Path, seed: i
         if t.go(robot, there):
             inserted += 1
             alone[robot] += float(np.linalg.norm(here - there))
-    assert inserted >= 6
+    assert inserted >= 4
     assert t.judged()
     assert t.makespan() >= max(alone.values()) - 1e-9
     for robot, rows in t.time.segments()[0].q.items():

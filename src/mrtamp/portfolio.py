@@ -26,7 +26,7 @@ _ALONE = 1200
 """The same where there is no convex programming."""
 _STALE = 0.004
 """Relative gain of a turn below which shortening has done its part."""
-_TRIAL = 5
+_TRIAL = 6
 """Conic programs that a plan gets before it is compared with the others."""
 _HOPELESS = 1.3
 """Plans that cost so many times the incumbent after their trial wait until nothing else is left to do."""
@@ -57,6 +57,11 @@ class _Entry:
     def cost(self) -> float:
         work = self.optimiser or self.refiner
         return work.cost if work is not None else self.plan.cost
+
+    @property
+    def outlook(self) -> float:
+        """What the plan is likely to cost soon."""
+        return self.optimiser.outlook if self.optimiser is not None else self.cost
 
     @property
     def on_trial(self) -> bool:
@@ -129,9 +134,9 @@ class Portfolio:
         trial = [e for e in self._entries if e.on_trial]
         if trial:
             return trial[-1]
-        going = [e for e in self._entries if not e.done and e.cost < _HOPELESS * incumbent]
+        going = [e for e in self._entries if not e.done and e.outlook < _HOPELESS * incumbent]
         if going:
-            return min(going, key=lambda e: e.cost)
+            return min(going, key=lambda e: e.outlook)
         waiting = [e for e in self._entries if not e.done]
         rested = [e for e in self._entries if e.done and e.fruitless < _ROUNDS and e.cost < _HOPELESS * incumbent]
         if rested:

@@ -117,6 +117,11 @@ class Optimiser:
         return self._best.cost
 
     @property
+    def outlook(self) -> float:
+        """Cost of the current iterate, which may still collide a little: what the best may soon be."""
+        return min(self._best.cost, self._now.cost)
+
+    @property
     def transitions(self) -> list[Transition]:
         """Transitions of the best iterate."""
         return self._best.arrangement.transitions

@@ -16,7 +16,7 @@ import numpy as np
 from mrtamp.kinematics import Tool
 from mrtamp.plan import Action, Segment, Transition
 
-REACH = 0.07
+REACH = 0.005
 """Length (m) of a contact motion, measured at the hand: the approach distance of the contact sampler."""
 _STILL = 1e-12
 _STRAIGHT = 1e-6
