@@ -19,7 +19,6 @@ from mrtamp.modes import start_mode
 from mrtamp.plan import Plan, Segment, Transition, plan_cost
 from mrtamp.problem import (
     AtConfiguration,
-    CostWeights,
     MovableObject,
     Problem,
     Robot,
@@ -56,7 +55,6 @@ def arena(
     subgoals: Sequence[Subgoal] = (),
     walls: Sequence[StaticBody] = (),
     objects: Sequence[MovableObject] = (),
-    cost: CostWeights = CostWeights(),
 ) -> Problem:
     """Discs that start, and perhaps have to end, somewhere, among walls."""
     model = disc_model(folder)
@@ -69,7 +67,6 @@ def arena(
         objects=tuple(objects),
         goal=tuple(RobotAt(name, np.array(q, dtype=float)) for name, q in (ends or {}).items()),
         subgoals=tuple(subgoals),
-        cost=cost,
     )
 
 

@@ -30,9 +30,7 @@ def coordinated(plan: Plan) -> Plan:
 
 def ends(plan: Plan) -> list[dict[str, np.ndarray]]:
     """Where every robot that acts stands at each transition, and where all stand in the end."""
-    at = [
-        {r: s.q[r][-1] for r in t.active} for s, t in zip(plan.segments[:-1], plan.transitions, strict=True)
-    ]
+    at = [{r: s.q[r][-1] for r in t.active} for s, t in zip(plan.segments[:-1], plan.transitions, strict=True)]
     return [*at, {r: q[-1] for r, q in plan.segments[-1].q.items()}]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arena import arena, visit
-from discs import RADIUS, disc_problem, errand
+from discs import RADIUS, Errands
 
 from mrtamp.check import check_plan
 from mrtamp.plan import Plan
@@ -43,18 +43,18 @@ def test_discs_that_would_overlap_get_none(tmp_path: Path) -> None:
 
 
 def test_a_plan_that_is_adopted_is_in_the_tree_knot_by_knot(tmp_path: Path) -> None:
-    """Whatever the plan, the tree then has a goal node of its cost, and traces it back to the same motion."""
-    problem = disc_problem(tmp_path)
-    plan = errand(problem)
+    """The tree then has a goal node of the plan's cost, and traces it back to the very same motion."""
+    subgoals = [visit("one", "a", (0, 1)), visit("two", "b", (0, -1), "one")]
+    problem = arena(tmp_path, {"a": (-1, 1), "b": (-1, -1)}, {"a": (1, 1)}, subgoals=subgoals)
+    plan = Errands(problem).move(a=(0, 1), b=(-0.5, -1)).reach("one").move(b=(0, -1)).reach("two").move(a=(1, 1)).plan()
     planner = Planner(problem, options=Options(initial_vertices=10))
-    # The start mode is the planner's own: attachments are known by identity.
-    own = planner.root.mode
-    from dataclasses import replace
-
-    segments = [replace(s, mode=own.replace(*(a for a in s.mode.attachments if a.held or a.support != own.of[a.object].support), done=s.mode.done)) for s in plan.segments]  # noqa: E501
-    transitions = plan.transitions
-    node = planner.growth.adopt(segments, transitions, planner.root)
+    before = {r: g.n_vertices for r, g in planner.roadmaps.items()}
+    node = planner.growth.adopt(plan.segments, plan.transitions, planner.root)
     assert node in planner.growth.goal_nodes
-    assert node.cost <= plan.cost + 1e-9
-    again = planner.growth.adopt(segments, transitions, planner.root)
-    assert again is node, "adopting twice adds nothing"
+    assert node.cost == pytest.approx(plan.cost)
+    segments, transitions, _ = planner.tree.trace(node)
+    assert [a.subgoal for t in transitions for a in t.actions] == ["one", "two"]
+    for mine, its in zip(segments, plan.segments, strict=True):
+        for robot, q in its.q.items():
+            np.testing.assert_array_equal(mine.q[robot], q)
+    assert all(g.n_vertices > before[r] for r, g in planner.roadmaps.items()), "knots are roadmap vertices"

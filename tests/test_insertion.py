@@ -28,9 +28,7 @@ class Skeleton:
         self.goal = {c.robot: self.parts.vertex(c.robot, tuple(c.q)) for c in problem.goal}
         self.visits = list(visits)
         self.robots = [tuple(problem.subgoal(v).targets) for v in visits]
-        self.at = [
-            {r: self.parts.vertex(r, tuple(t.q)) for r, t in problem.subgoal(v).targets.items()} for v in visits
-        ]
+        self.at = [{r: self.parts.vertex(r, tuple(t.q)) for r, t in problem.subgoal(v).targets.items()} for v in visits]
         self.parts.scatter(vertices)
         self.insertion = self.parts.insertion()
 
@@ -39,12 +37,8 @@ class Skeleton:
 
     def realise(self) -> Plan | None:
         """The plan, judged; None when insertion fails."""
-        before = [
-            [i for i, v in enumerate(self.visits) if v in self.problem.subgoal(w).after] for w in self.visits
-        ]
-        timed = self.insertion.realise(
-            self.parts.root, self.parts.start, self.robots, before, self.stand, self.goal
-        )
+        before = [[i for i, v in enumerate(self.visits) if v in self.problem.subgoal(w).after] for w in self.visits]
+        timed = self.insertion.realise(self.parts.root, self.parts.start, self.robots, before, self.stand, self.goal)
         if timed is None:
             assert self.insertion.stuck is not None
             return None

@@ -77,12 +77,12 @@ def active_sets(choices: list[Choice]) -> set[frozenset[str]]:
     return out
 
 
-def assert_all_grow(planner: Watched, kinds: list[str], iterations: int) -> None:
-    """What was feasible after so many iterations has been tried more often after twice as many."""
+def assert_all_grow(planner: Watched, kinds: list[str], iterations: int, more: int) -> None:
+    """What was feasible after so many iterations has been tried more often after so many more."""
     list(planner.improve(iterations=iterations))
     assert planner.best is not None and check_plan(planner.best).ok
     early = planner.tallies()
-    list(planner.improve(iterations=iterations))
+    list(planner.improve(iterations=more))
     late = planner.tallies()
     for kind in kinds:
         alive = [x for x in early[kind] if x in late[kind]]
@@ -97,13 +97,13 @@ def visiting(folder: Path) -> Problem:
     subgoals = [
         visit("one", "a", (0.0, 0.5)),
         visit("two", "b", (0.0, -0.5)),
-        visit("three", "a", (0.5, -1.0), "two"),
+        visit("three", "a", (0.5, -1.0)),
     ]
     return arena(folder, {"a": (-1, 0), "b": (1, 0)}, {"a": (-1, 0)}, subgoals=subgoals)
 
 
 def carrying(folder: Path) -> Problem:
-    """Two gantries; `red` has to go to a target, `blue` may stay where it is, and there is room for it elsewhere."""
+    """Two gantries and a bar that has to go to a target; there is room for it elsewhere, too."""
     model = gantry_model(folder)
     table = StaticBody("table", RigidTransform([0, 0, -0.02]), Shape("box", (2.0, 2.0, 0.04)))
     floor = Support("floor", "table", RigidTransform([0, 0, 0.02]), (1.2, 0.8))
@@ -112,7 +112,7 @@ def carrying(folder: Path) -> Problem:
     bar = Shape("box", (0.16, 0.04, 0.05))
     objects = tuple(
         MovableObject(name, "table", RigidTransform([x, y, 0.045]), "floor", bar, grasps=grasps)
-        for name, x, y in (("red", -0.2, 0.0), ("blue", 0.2, -0.2))
+        for name, x, y in (("red", 0.0, 0.0),)
     )
     homes = {"left": np.array([-0.5, 0.0, 0.3, 0.0]), "right": np.array([0.5, 0.0, 0.3, 0.0])}
     robots = tuple(Robot(name, model, RigidTransform(), q, q) for name, q in homes.items())
@@ -121,20 +121,19 @@ def carrying(folder: Path) -> Problem:
 
 def test_orbits_strata_and_active_sets_of_discs_are_visited_for_ever(tmp_path: Path) -> None:
     planner = Watched(visiting(tmp_path))
-    assert_all_grow(planner, ["orbit", "modal state", "stratum", "active set"], 70)
+    assert_all_grow(planner, ["orbit", "modal state", "stratum", "active set"], 70, 70)
     assert set(planner.tallies()["active set"]) == {frozenset("a"), frozenset("b"), frozenset("ab")}
     assert {key[0] for key in planner.sampler.outcomes} == {"reach"}
 
 
 def test_strata_active_sets_and_modal_states_of_gantries_are_visited_for_ever(tmp_path: Path) -> None:
-    """Every kind, robot, object and place: also taking away what has no need to move, and putting it anywhere."""
+    """Every kind, robot and place: also taking away what is at its goal already, and putting it anywhere."""
     planner = Watched(carrying(tmp_path))
-    assert_all_grow(planner, ["stratum", "active set"], 130)
+    assert_all_grow(planner, ["stratum", "active set"], 60, 120)
     tried = {key for key, o in planner.sampler.outcomes.items() if o.calls}
     for robot in ("left", "right"):
-        for item in ("red", "blue"):
-            assert {("pick", (robot,), item, "floor"), ("place", (robot,), item, "floor")} <= tried
-            assert ("place", (robot,), item, "target") in tried
+        for kind in ("pick", "place"):
+            assert {(kind, (robot,), "red", "floor"), (kind, (robot,), "red", "target")} <= tried
     assert {key[0] for key in tried} == {"pick", "place", "handover"}
 
 

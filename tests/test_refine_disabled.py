@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from arena import arena, visit, wall
 
-import mrtamp
 from mrtamp.check import check_plan
 from mrtamp.mechanisms import MECHANISMS
 from mrtamp.planner import Options, Planner
@@ -19,7 +18,9 @@ def swap(folder: Path) -> Problem:
     """Two discs pass each other at a pillar, with one visit each."""
     subgoals = [visit("one", "a", (1.0, 0.4)), visit("two", "b", (-1.0, -0.4), "one")]
     starts = {"a": (-1.0, 0.4), "b": (1.0, -0.4)}
-    return arena(folder, starts, {"a": (-1.0, 0.4)}, subgoals=subgoals, walls=[wall("pillar", (-0.1, -0.1), (0.1, 0.1))])
+    return arena(
+        folder, starts, {"a": (-1.0, 0.4)}, subgoals=subgoals, walls=[wall("pillar", (-0.1, -0.1), (0.1, 0.1))]
+    )
 
 
 @pytest.mark.parametrize("name", list(MECHANISMS))

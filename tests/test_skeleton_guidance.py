@@ -13,8 +13,8 @@ import mrtamp
 from mrtamp.modes import Mode
 from mrtamp.planner import Options, Planner
 from mrtamp.problem import Problem
-from mrtamp.tasks import pick_place
 from mrtamp.skeleton_guidance import Proposal
+from mrtamp.tasks import pick_place
 
 
 def ready(problem: Problem) -> Planner:
@@ -123,7 +123,7 @@ def test_a_stop_becomes_one_candidate_however_often_it_is_asked_for() -> None:
     planner = ready(pick_place(2, 2))
     guidance, mode = planner.skeletons, planner.root.mode
     for proposal in guidance.propose():
-        stop, way = proposal.stops[0]
+        stop, _ = proposal.stops[0]
         candidate = guidance.candidate(stop, mode)
         if candidate is not None:
             break

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,16 +20,18 @@ from mrtamp.validity import Validity
 SIZE = 6
 _SLICE = 40
 """Proposals of shortening per turn."""
-_SHORTENING = 160
+_SHORTENING = 80
 """Proposals after which shortening gives way to convex programming."""
 _ALONE = 1200
 """The same where there is no convex programming."""
 _STALE = 0.004
 """Relative gain of a turn below which shortening has done its part."""
-_TRIAL = 6
+_TRIAL = 5
 """Conic programs that a plan gets before it is compared with the others."""
-_HOPELESS = 1.3
+_HOPELESS = 1.12
 """Plans that cost so many times the incumbent after their trial wait until nothing else is left to do."""
+_LATELY, _CRAWL = 5, 0.01
+"""Conic programs over which a first round has to gain that share to go on."""
 _ROUNDS = 3
 """Times that a finished plan is shaken and refined again without gain before it is left alone."""
 _ALIKE = 0.02
@@ -48,10 +50,14 @@ class _Entry:
     optimiser: Optimiser | None = None
     proposals: int = 0
     done: bool = False
+    rounds: int = 0
+    """How often refinement has converged."""
     fruitless: int = 0
-    """Rounds without gain."""
+    """How often since it last gained anything."""
     before: float = np.inf
     """Cost when this round began."""
+    trail: list[float] = field(default_factory=list)
+    """Outlook after every conic program of this round."""
 
     @property
     def cost(self) -> float:
@@ -62,6 +68,13 @@ class _Entry:
     def outlook(self) -> float:
         """What the plan is likely to cost soon."""
         return self.optimiser.outlook if self.optimiser is not None else self.cost
+
+    @property
+    def slow(self) -> bool:
+        """Whether a first round gains so little that other plans are worth more; later rounds go on to the end."""
+        trail = self.trail[-_LATELY:]
+        clean = self.optimiser is not None and self.optimiser.cost <= (1 + _CRAWL) * self.outlook
+        return self.rounds == 0 and clean and len(trail) == _LATELY and trail[0] - trail[-1] < _CRAWL * trail[-1]
 
     @property
     def on_trial(self) -> bool:
@@ -120,8 +133,9 @@ class Portfolio:
         if entry.optimiser is None:
             return self._shorten(entry, incumbent)
         entry.optimiser.step()
+        entry.trail.append(entry.optimiser.outlook)
         plan = self._offer(entry, incumbent, entry.optimiser)
-        if entry.optimiser.converged:
+        if entry.optimiser.converged or entry.slow:
             self._finish(entry)
         return plan
 
@@ -178,6 +192,8 @@ class Portfolio:
             entry.plan.transitions,
             self.sampler.families,
             slide=self.sliding,
+            # Finer steps beside bends gain little: they wait until a plan has proved itself.
+            levels=entry.rounds,
         )
 
     def _finish(self, entry: _Entry) -> None:
@@ -188,6 +204,8 @@ class Portfolio:
                 entry.plan = plan
         gained = entry.before - entry.plan.cost > WORTH_CHECKING * entry.plan.cost
         entry.fruitless = 0 if gained else entry.fruitless + 1
+        entry.rounds += 1
+        entry.trail.clear()
         entry.done, entry.refiner, entry.optimiser = True, None, None
         self._settled.append(entry.plan)
 

@@ -59,6 +59,8 @@ class Collisions:
         self.nearness = nearness
         self.tolerance = tolerance
         self.level = 0
+        self.pad = 0.0
+        """Clearance (m) that is asked for everywhere on top, to come free of collision between samples too."""
         self._demands: Demands = {}
 
     # -- demands ----------------------------------------------------------------------------------------------------
@@ -96,7 +98,7 @@ class Collisions:
 
     def _samples(self, n: int, extra: Mapping[tuple[int, float, int], int]) -> tuple[Samples, np.ndarray]:
         """The samples demanded, and the clearance asked for at n common ones and at each of them."""
-        least = _MARGIN / _FINER**self.level - _SHARE * self.tolerance
+        least = _MARGIN / _FINER**self.level - _SHARE * self.tolerance + self.pad
         margin = np.full(n, least)
         if not extra:
             return Samples.none(), margin

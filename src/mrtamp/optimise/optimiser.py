@@ -28,14 +28,20 @@ from mrtamp.problem import Problem
 from mrtamp.transitions.families import GraspFamily
 
 LEVELS = 1
-TRUST = 0.2
+TRUST = 0.35
 """First radius (rad) of the trust region of every joint."""
-_LARGEST, _SMALLEST = 0.4, 0.01
+_LARGEST, _SMALLEST = 0.5, 0.01
 _DEEP = 0.03
 """Penetration (m) at which a step is rejected."""
 _SHALLOW = 1e-3
 """Penetration (m) at the program's own samples that makes a finer look pointless."""
 _TRUE, _FALSE = 0.7, 0.25
+_GRAZES = 2
+"""Iterates in collision, one after another, after which more clearance is asked for."""
+_PADS = (0.0, 0.003, 0.006)
+_WORTH_CLEARING = 0.005
+_CHANCES = 4
+"""Steps that a polyline which has converged in collision gets to come free."""
 _STALL = 1e-3
 _PATIENCE = 6
 _EPS = 1e-9
@@ -95,6 +101,8 @@ class Optimiser:
         self.trust = TRUST
         self.converged = False
         self._stalls = 0
+        self._grazing = 0
+        self._last_chances = _CHANCES
         self._trail: list[float] = []
         self._worth = np.inf
         self._promise = 0.0
@@ -209,6 +217,7 @@ class Optimiser:
         if clean and candidate.cost < self._best.cost - _EPS:
             gain = self._best.cost - candidate.cost
             self._best = candidate
+        self._clear_up(clean)
         self._pace(before, after, self._promise + self._changes, clean)
         if self._now is candidate and candidate.line.lengths(candidate.q).max() > 1.4 * self.knot:
             self._resample()
@@ -226,6 +235,14 @@ class Optimiser:
         self._stalls = 0 if not still else self._stalls + (2 if clean else 1)
         self._settle(self.trust < _SMALLEST or self._stalls >= _PATIENCE)
 
+    def _clear_up(self, clean: bool) -> None:
+        """When cheaper iterates keep grazing something between samples, ask for more clearance until one does not."""
+        self._grazing = 0 if clean else self._grazing + 1
+        promising = self._now.cost < (1 - _WORTH_CLEARING) * self._best.cost
+        pad = _PADS[min(self._grazing // _GRAZES, len(_PADS) - 1)] if promising else 0.0
+        if pad != self.collisions.pad:
+            self.collisions.pad, self._rows = pad, None
+
     def _settle(self, done: bool) -> None:
         """Where the polyline has converged, go on with finer steps beside its bends."""
         level = self.collisions.level
@@ -240,6 +257,12 @@ class Optimiser:
             self._trail.clear()
             self._return_to(self._best)
             self._resample()
+        elif done and self._now.cost < (1 - _WORTH_CLEARING) * self._best.cost and self._last_chances:
+            # What has converged still grazes something: it must come free to count.
+            self._last_chances -= 1
+            self._stalls, self.trust = 0, max(self.trust, 4 * _SMALLEST)
+            if self.collisions.pad < _PADS[-1]:
+                self.collisions.pad, self._rows = _PADS[-1], None
         else:
             self.converged = done
 

@@ -195,5 +195,8 @@ class ContactBuilder:
     def _widths(self, robot: str, grasp: Attachment) -> np.ndarray:
         """Opening widths (m) from open to closed on the object."""
         gripper = self.problem.robot(robot).model.gripper
-        assert gripper is not None and grasp.width is not None
+        assert gripper is not None
+        if grasp.width is None:
+            # Taken by a subgoal: the fingers do not move.
+            return np.array([gripper.max_width])
         return np.linspace(gripper.max_width, grasp.width, 5)
