@@ -7,12 +7,12 @@ other robots aside (Kuffner and LaValle, 2000).  What they find are vertices lik
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from mrtamp.collision import bisection_order
-from mrtamp.modes import Mode
+from mrtamp.modes import Attachment, Mode
 from mrtamp.roadmap import Roadmap
 from mrtamp.transitions.projection import uniform_configurations
 from mrtamp.validity import Validity
@@ -50,10 +50,19 @@ class Connector:
         self.validity = validity
         self.rng = rng
 
-    def connect(self, roadmap: Roadmap, mode: Mode, a: int, b: int, iterations: int) -> bool:
+    def connect(
+        self,
+        roadmap: Roadmap,
+        mode: Mode,
+        a: int,
+        b: int,
+        iterations: int,
+        standing: Mapping[str, np.ndarray] | None = None,
+    ) -> bool:
         """Join two vertices by a path that is free of the robot's own world in `mode`; whether one was found.
 
-        Contact vertices are joined from the far ends of their chains.
+        Contact vertices are joined from the far ends of their chains.  `standing` are configurations of other robots
+        that the path has to keep clear of as well.
         """
         starts, goals = (list(roadmap.exits.get(v, []))[-1:] or [v] for v in (a, b))
         world = roadmap.world
@@ -63,7 +72,10 @@ class Connector:
         def free(p: np.ndarray, q: np.ndarray) -> bool:
             n = roadmap.samples_between(p, q)
             t = np.linspace(0, 1, n)[bisection_order(n)][:, None]
-            return world.first_hit(world.rows(p + t * (q - p), held, objects)) < 0
+            x = p + t * (q - p)
+            if world.first_hit(world.rows(x, held, objects)) >= 0:
+                return False
+            return all(self._apart(roadmap.name, x, held, o, y, mode.held.get(o)) for o, y in (standing or {}).items())
 
         reach = _REACH * float(np.mean(np.minimum(world.chain.upper - world.chain.lower, 2.0)))
         one, two = _Tree(roadmap.q[starts[0]]), _Tree(roadmap.q[goals[0]])
@@ -93,6 +105,13 @@ class Connector:
                     self._put(roadmap, starts[0], goals[0], self._shortened(knots, free))
                     return True
         return False
+
+    def _apart(
+        self, robot: str, q: np.ndarray, held: Attachment | None, other: str, y: np.ndarray, load: Attachment | None
+    ) -> bool:
+        pair, swapped = self.validity.collision.pair(robot, other)
+        there = np.tile(y, (len(q), 1))
+        return (pair.first_hit(there, load, q, held) if swapped else pair.first_hit(q, held, there, load)) < 0
 
     def _shortened(
         self, knots: list[np.ndarray], free: Callable[[np.ndarray, np.ndarray], bool]

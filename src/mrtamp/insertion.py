@@ -23,6 +23,8 @@ from mrtamp.validity import Validity
 
 _DEPTH = 2
 """How many robots may have to move for one another in a chain."""
+_AROUND = 12
+"""Lazy searches for a way past standing robots."""
 _ASIDE = 6
 """Random vertices offered to a robot that is in the way."""
 
@@ -182,7 +184,8 @@ class Insertion:
             return None
         trial: _State | None = state
         for robot, v in candidate.at.items():
-            trial = self._bring(trial, robot, v, targets, depth) if trial is not None else None
+            partners = frozenset(r for r, w in candidate.at.items() if r != robot and trial and trial.at[r] == w)
+            trial = self._bring(trial, robot, v, targets, depth, partners) if trial is not None else None
         if trial is None or any(trial.at[r] != v for r, v in candidate.at.items()):
             return None
         transition = Transition((candidate.action,))
@@ -209,7 +212,15 @@ class Insertion:
                 return trial
         return None
 
-    def _bring(self, state: _State, robot: str, v: int, targets: Mapping[str, int], depth: int) -> _State | None:
+    def _bring(
+        self,
+        state: _State,
+        robot: str,
+        v: int,
+        targets: Mapping[str, int],
+        depth: int,
+        partners: frozenset[str] = frozenset(),
+    ) -> _State | None:
         """The schedule with a leg to vertex v inserted, others moved out of the way first where they stand in it."""
         if state.at[robot] == v:
             return state
@@ -220,9 +231,16 @@ class Insertion:
         if trial.time.insert(leg):
             trial.at[robot] = v
             return trial
+        blockers = state.time.in_the_way(leg)
+        if partners & set(blockers):
+            # Those it is to meet stay where they are: another way, past them.
+            around = self._leg(state, robot, v, partners)
+            if around is not None and trial.time.insert(around):
+                trial.at[robot] = v
+                return trial
         if depth == 0:
             return None
-        for other in state.time.in_the_way(leg):
+        for other in blockers:
             for w in self._ways_out(state, other, targets):
                 if not self._clears(state, other, w, leg):
                     continue
@@ -247,11 +265,15 @@ class Insertion:
         trial.at[robot] = self._row(robot, v)
         return robot not in trial.in_the_way(leg)
 
-    def _leg(self, state: _State, robot: str, v: int) -> Leg | None:
+    def _leg(self, state: _State, robot: str, v: int, around: frozenset[str] = frozenset()) -> Leg | None:
+        """The shortest way past the static world and the robots `around`, as far as those are known to stay."""
         at = tuple(state.at[r] for r in self.names)
-        others = {r for r in self.names if r != robot}
-        detour = self.rng.random() < self._variety
-        path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, detour=detour)
+        others = {r for r in self.names if r != robot} - around
+        if around:
+            path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, rounds=_AROUND, seek=True)
+        else:
+            detour = self.rng.random() < self._variety
+            path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, detour=detour)
         if path is None:
             return None
         rows = [state.time.at[robot]]

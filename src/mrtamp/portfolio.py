@@ -20,8 +20,8 @@ from mrtamp.validity import Validity
 SIZE = 6
 _SLICE = 40
 """Proposals of shortening per turn."""
-_SHORTENING = 80
-"""Proposals after which shortening gives way to convex programming."""
+_SHORTENING = 6
+"""Proposals, per robot and transition, after which shortening gives way to convex programming."""
 _ALONE = 1200
 """The same where there is no convex programming."""
 _STALE = 0.004
@@ -168,7 +168,8 @@ class Portfolio:
         plan = self._offer(entry, incumbent, entry.refiner)
         if entry.refiner is None:
             return plan
-        enough = entry.proposals >= (_SHORTENING if self.convex else _ALONE)
+        size = len(self.roadmaps) * max(len(entry.plan.transitions), 1)
+        enough = entry.proposals >= (_SHORTENING * size if self.convex else _ALONE)
         if enough or (entry.proposals > 2 * _SLICE and gain < _STALE * entry.cost):
             if self.convex:
                 self._begin_convex(entry)

@@ -117,11 +117,12 @@ class Steering:
         ignore: set[str] | None = None,
         rounds: int = ROUNDS,
         detour: bool = False,
+        seek: bool = False,
     ) -> tuple[list[int] | None, Counter[str]]:
         """Shortest valid path of one robot while the others stand, and how often each of those was in the way.
 
         `detour` asks for a path past a random vertex that is not far out of the way, where there is one: other ways
-        around things become plans too.
+        around things become plans too.  `seek`: where the roadmap lacks a way past standing robots, look for one.
         """
         roadmap = self.roadmaps[self.index[robot]]
         start = at[self.index[robot]]
@@ -151,7 +152,8 @@ class Steering:
                 return path, blockers
             blocked = self.validity.blocked(robot, mode, standing)
         path = lazy_path(roadmap, start, goal, blocked, validate, rounds)
-        if path is None and not blockers and self._connects(roadmap, mode, start, goal):
+        others = {r: self.roadmaps[self.index[r]].q[v] for r, v in standing.items()} if seek else {}
+        if path is None and (seek or not blockers) and self._connects(roadmap, mode, start, goal, others):
             blocked = self.validity.blocked(robot, mode, standing)
             path = lazy_path(roadmap, start, goal, blocked, validate, rounds)
         return path, blockers
@@ -177,12 +179,16 @@ class Steering:
         two = lazy_path(roadmap, w, goal, blocked, validate, rounds) if one is not None else None
         return None if one is None or two is None else [*one, *two[1:]]
 
-    def _connects(self, roadmap: Roadmap, mode: Mode, start: int, goal: int) -> bool:
-        """The roadmap has no way where no other robot is to blame: look for one, harder each time, and not for ever."""
-        key = (roadmap.name, mode.key, start, goal)
+    def _connects(
+        self, roadmap: Roadmap, mode: Mode, start: int, goal: int, standing: Mapping[str, np.ndarray]
+    ) -> bool:
+        """The roadmap has no way: look for one, harder each time, and ever more rarely where that is in vain."""
+        key = (roadmap.name, mode.key, start, goal, *(x.tobytes() for x in standing.values()))
         self._sought[key] += 1
         tries = self._sought[key]
-        return tries <= _SEARCHES and self.connector.connect(roadmap, mode, start, goal, _TREE << tries)
+        if tries > _SEARCHES and tries & (tries - 1):
+            return False
+        return self.connector.connect(roadmap, mode, start, goal, _TREE << min(tries, _SEARCHES), standing)
 
     def _follow(self, node: Node, robot: str, path: list[int]) -> Node:
         i = self.index[robot]

@@ -93,8 +93,8 @@ class ReachTarget:
             X = self.target.X_WG.GetAsMatrix4()
             R, p = np.tile(X[:3, :3], (n, 1, 1)), np.tile(X[:3, 3], (n, 1))
         else:
-            # Towards the nearest point of the box or anywhere in it: paths often touch its edge.  By coordinate, because
-            # hands that move in a plane only cannot follow a coordinate out of it.
+            # Towards the nearest point of the box or anywhere in it: paths often touch its edge.  By coordinate: hands
+            # that move in a plane only cannot follow a coordinate out of it.
             anywhere = rng.uniform(-self._half, self._half, size=(n, 3))
             drawn = rng.random((n, 3)) < rng.random((n, 1))
             local = np.where(drawn, anywhere, np.clip(self._local(p), -self._half, self._half))

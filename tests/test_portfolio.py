@@ -1,0 +1,65 @@
+"""The portfolio: plans take turns under refinement, never get worse, and come to rest when nothing promises a gain."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from arena import XY, arena, visit
+from discs import Errands
+
+from mrtamp.check import check_plan
+from mrtamp.plan import Plan
+from mrtamp.planner import Options, Planner
+from mrtamp.portfolio import SIZE
+
+STARTS: Mapping[str, XY] = {"a": (-1, 1), "b": (-1, -1)}
+
+
+def planner_for(folder: Path, robots: str = "ab") -> Planner:
+    """Every disc has to visit the other side of the square."""
+    subgoals = [visit(f"{r} there", r, (1, STARTS[r][1])) for r in robots]
+    problem = arena(folder, {r: STARTS[r] for r in robots}, subgoals=subgoals)
+    return Planner(problem, options=Options(initial_vertices=5))
+
+
+def roundabout(planner: Planner, height: float) -> Plan:
+    """One disc after the other, by way of a point in the middle, so high."""
+    errands = Errands(planner.problem)
+    for robot in planner.names:
+        errands.move(**{robot: (0, height * STARTS[robot][1])}).move(**{robot: (1, STARTS[robot][1])})
+        errands.reach(f"{robot} there")
+    plan = errands.plan()
+    assert check_plan(plan).ok
+    return plan
+
+
+@pytest.mark.parametrize("robots", ["a", "ab"])
+def test_plans_are_refined_to_the_optimum_and_then_left_alone(tmp_path: Path, robots: str) -> None:
+    """Straight across, all at the same time: makespan 2, and 2 of path for each."""
+    planner = planner_for(tmp_path, robots)
+    portfolio, best = planner.portfolio, roundabout(planner, 0.6)
+    assert portfolio.idle(best.cost), "nothing to do yet"
+    portfolio.add(best)
+    turns = 0
+    while not portfolio.idle(best.cost) and turns < 300:
+        plan = portfolio.improve(best.cost)
+        turns += 1
+        if plan is not None:
+            assert plan.cost < best.cost
+            assert check_plan(plan).ok
+            best = plan
+    assert turns < 300, "it comes to rest"
+    assert best.cost == pytest.approx(2.0 + 0.02 * len(robots), rel=5e-3)
+    assert best.cost >= 2.0 + 0.02 * len(robots) - 1e-6
+
+
+def test_a_plan_is_taken_once_and_only_so_many_are_kept(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    plan = roundabout(planner, 0.9)
+    assert planner.portfolio.add(plan)
+    assert not planner.portfolio.add(plan)
+    taken = sum(planner.portfolio.add(roundabout(planner, 0.8 - 0.2 * k)) for k in range(SIZE + 2))
+    assert taken >= SIZE - 1
+    assert len(planner.portfolio._entries) == SIZE
