@@ -78,6 +78,8 @@ class Connector:
             return all(self._apart(roadmap.name, x, held, o, y, mode.held.get(o)) for o, y in (standing or {}).items())
 
         reach = _REACH * float(np.mean(np.minimum(world.chain.upper - world.chain.lower, 2.0)))
+        if not all(free(roadmap.q[v], roadmap.q[v]) for v in (starts[0], goals[0])):
+            return False
         one, two = _Tree(roadmap.q[starts[0]]), _Tree(roadmap.q[goals[0]])
         for k in range(iterations):
             here, there = (one, two) if k % 2 == 0 else (two, one)
@@ -113,9 +115,7 @@ class Connector:
         there = np.tile(y, (len(q), 1))
         return (pair.first_hit(there, load, q, held) if swapped else pair.first_hit(q, held, there, load)) < 0
 
-    def _shortened(
-        self, knots: list[np.ndarray], free: Callable[[np.ndarray, np.ndarray], bool]
-    ) -> list[np.ndarray]:
+    def _shortened(self, knots: list[np.ndarray], free: Callable[[np.ndarray, np.ndarray], bool]) -> list[np.ndarray]:
         for _ in range(_SHORTCUTS):
             if len(knots) < 3:
                 break

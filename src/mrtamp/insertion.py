@@ -23,6 +23,8 @@ from mrtamp.validity import Validity
 
 _DEPTH = 2
 """How many robots may have to move for one another in a chain."""
+_TABLES = 60_000
+"""Cached answers after which the tables are emptied."""
 _AROUND = 12
 """Lazy searches for a way past standing robots."""
 _ASIDE = 6
@@ -72,11 +74,16 @@ class Insertion:
         self.steering = steering
         self.rng = rng
         self.stuck: int | None = None
-        self._clearances = Clearances(collision, validity, self.names)
-        self._rows: dict[tuple[str, int], int] = {}
-        self._edges: dict[tuple[str, int, int], list[int]] = {}
+        self._collision = collision
+        self._forget()
         self._known: dict[tuple[int, Mode], Candidate | None] = {}
         self._variety = 0.0
+
+    def _forget(self) -> None:
+        """Start with empty tables: what they hold is soon of no use, and there is always more."""
+        self._clearances = Clearances(self._collision, self.validity, self.names)
+        self._rows: dict[tuple[str, int], int] = {}
+        self._edges: dict[tuple[str, int, int], list[int]] = {}
 
     def realise(
         self,
@@ -102,6 +109,8 @@ class Insertion:
         self.stuck = None
         self._variety = variety
         self._known.clear()
+        if self._clearances.size > _TABLES:
+            self._forget()
         q = {r: self.roadmaps[r].q[v] for r, v in start.items()}
         time = SpaceTime(self._clearances, q, [root])
         state = _State(time, dict(start), root, tuple(range(len(robots))))

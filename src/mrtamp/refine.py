@@ -406,7 +406,7 @@ class Refiner:
         if window is None:
             return
         i, j = window
-        pace = np.delete(self._lengths[:, i:j], index, axis=0).max(axis=0)
+        pace = np.delete(self._lengths[:, i:j], index, axis=0).max(axis=0, initial=0.0)
         plane = _Plane(
             index,
             i,

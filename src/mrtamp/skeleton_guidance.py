@@ -180,8 +180,7 @@ class SkeletonGuidance:
     def _option(self, ways: list[Way], penalised: bool) -> Option:
         stops = ways[0].stops
         events = tuple(
-            Event(s.kind, {r: np.array([w.stops[i].q[r] for w in ways]) for r in s.robots})
-            for i, s in enumerate(stops)
+            Event(s.kind, {r: np.array([w.stops[i].q[r] for w in ways]) for r in s.robots}) for i, s in enumerate(stops)
         )
         constant = sum(self.problem.cost.transitions.get(s.kind, 0.0) for s in stops)
         penalty = np.array([w.penalty for w in ways]) if penalised else None

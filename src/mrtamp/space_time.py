@@ -64,6 +64,11 @@ class Clearances:
         self._rows: dict[tuple, tuple[np.ndarray, np.ndarray | None]] = {}
         self._balls: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
 
+    @property
+    def size(self) -> int:
+        """Number of cached answers and samples."""
+        return len(self._pairs) + len(self._objects) + len(self._rows) + len(self._balls) + len(self._sampled)
+
     def row(self, robot: str, q: np.ndarray) -> int:
         """Put a configuration into a robot's table."""
         self.tables[robot].append(q)
@@ -110,9 +115,7 @@ class Clearances:
         travel = max(self._sample(robot, move.a, move.b)[3] for robot, move in robots)
         return max(2, int(np.ceil(travel / RESOLUTION)) + 1)
 
-    def apart(
-        self, one: str, a: Move, held_a: Attachment | None, two: str, b: Move, held_b: Attachment | None
-    ) -> bool:
+    def apart(self, one: str, a: Move, held_a: Attachment | None, two: str, b: Move, held_b: Attachment | None) -> bool:
         """Whether two robots keep clear of each other in one step."""
         if one > two:
             one, a, held_a, two, b, held_b = two, b, held_b, one, a, held_a

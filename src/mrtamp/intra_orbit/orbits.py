@@ -66,6 +66,7 @@ class Orbits:
         orbit = self.graphs.add_orbit(mode) if known is None else None
         after = self.tree.insert_transition(node, transition, mode, orbit, cost)
         if not seen:
+            self.graphs.discover(mode.state, node.mode.state)
             self.graphs.transition(node.orbit, after.orbit)
         return after
 

@@ -30,6 +30,8 @@ from mrtamp.transitions.families import GraspFamily
 LEVELS = 1
 TRUST = 0.35
 """First radius (rad) of the trust region of every joint."""
+_SLIDING = 0.2
+"""The same (m) where all joints slide: a step of that size takes a whole robot along."""
 _LARGEST, _SMALLEST = 0.5, 0.01
 _DEEP = 0.03
 """Penetration (m) at which a step is rejected."""
@@ -98,7 +100,8 @@ class Optimiser:
         self.levels = levels
         self.slide = slide
         self.steps = 0
-        self.trust = TRUST
+        self._first_trust = _SLIDING if all(w.chain.prismatic.all() for w in self.worlds.values()) else TRUST
+        self.trust = self._first_trust
         self.converged = False
         self._stalls = 0
         self._grazing = 0
@@ -253,7 +256,7 @@ class Optimiser:
         if done and level < self.levels:
             self.collisions.level += 1
             self.collisions.forget()
-            self._stalls, self.trust = 0, TRUST / 2**self.collisions.level
+            self._stalls, self.trust = 0, self._first_trust / 2**self.collisions.level
             self._trail.clear()
             self._return_to(self._best)
             self._resample()

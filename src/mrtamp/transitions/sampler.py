@@ -109,7 +109,7 @@ class TransitionSampler(Workspace):
             stats.collisions["gripper too small"] += 1
             return []
         before = dict(stats.collisions)
-        parts, grasps = [], []
+        parts, grasps, families = [], [], []
         for _ in range(_ROUNDS):
             drawn = self.draw(robot, strata, n, stats)
             if drawn is None:
@@ -119,6 +119,7 @@ class TransitionSampler(Workspace):
                 f = int(family[k])
                 stats.fits[strata[f].family.name] += 1
                 parts.append(q[k])
+                families.append(f)
                 grasps.append(self.grasp(robot, item, self.families[robot, item][f], f, c[k]))
             if len(grasps) >= _ENOUGH:
                 break
@@ -138,7 +139,7 @@ class TransitionSampler(Workspace):
             self._roomiest[robot, item] = max(self._roomiest.get((robot, item), 0.0), float(room.max()))
             promising = room >= _ROOMY * self._roomiest[robot, item]
             near = near - 30.0 * room
-        order = self.mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON))
+        order = self.mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON), families)
         out: list[Candidate] = []
         for i in order[: 4 * keep]:
             v = self.contacts.contact(robot, placement, chain, grasps[i], q[i], stats, mode)
@@ -283,10 +284,17 @@ class TransitionSampler(Workspace):
         rows = np.flatnonzero(solved)
         return q[rows], family[rows], [choices[i] for i in rows]
 
-    def mixed_order(self, score: np.ndarray) -> np.ndarray:
-        """Mostly the lowest scores first, every third one drawn at random, so that no sample is excluded."""
+    def mixed_order(self, score: np.ndarray, family: Sequence[int] | None = None) -> np.ndarray:
+        """Mostly the lowest scores first, every third one drawn at random, so that no sample is excluded.
+
+        With `family` (N,) the random ones come from every family as often, however few samples it has.
+        """
         ranked = np.argsort(score, kind="stable")
-        shuffled = self.rng.permutation(len(score))
+        if family is None or not len(family):
+            shuffled = self.rng.permutation(len(score))
+        else:
+            share = 1.0 / np.bincount(family)[np.asarray(family)]
+            shuffled = self.rng.choice(len(score), size=len(score), replace=False, p=share / share.sum())
         out: list[int] = []
         a, b = iter(ranked), iter(shuffled)
         seen: set[int] = set()

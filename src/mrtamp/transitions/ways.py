@@ -347,4 +347,3 @@ class Ways:
         if not others or world.first_hit(rows, after.parent, slot) < 0:
             return 0.0
         return float(len({x for pair in world.culprits(rows[0], after.parent, slot) for x in pair if x in others}))
-
