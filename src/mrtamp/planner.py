@@ -5,6 +5,7 @@ Read `Planner.improve` beside the algorithm; each named step is a method below i
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -249,6 +250,15 @@ class Planner:
         assert self.best is not None
         return self.best
 
+    def _offer(self, plan: Plan) -> bool:
+        """Make a checked plan the incumbent if it is cheaper; the modal graph then has its states."""
+        if not self.incumbent.offer(plan, self._elapsed()):
+            return False
+        for one, two in itertools.pairwise(plan.segments):
+            self.graphs.discover(one.mode.state)
+            self.graphs.discover(two.mode.state, one.mode.state)
+        return True
+
     def _elapsed(self) -> float:
         """Seconds spent planning, over all calls."""
         return time.perf_counter() - self._clock
@@ -478,7 +488,7 @@ class Planner:
 
     def _adopt(self, plan: Plan) -> bool:
         """A checked plan that the tree does not have yet: into the tree, and under refinement."""
-        better = self.incumbent.offer(plan, self._elapsed())
+        better = self._offer(plan)
         if self._found(plan) and self._uses("adoption"):
             self._graft(plan)
         return better
@@ -536,7 +546,7 @@ class Planner:
                     # Whatever is wrong is not a step that could be withdrawn.
                     self.growth.orbits.remove(node)
                 return False
-        better = self.incumbent.offer(plan, self._elapsed())
+        better = self._offer(plan)
         if better:
             self._path = [g[0].orbit for g in groups]
         self._found(plan)
@@ -545,7 +555,7 @@ class Planner:
     def _refine(self) -> bool:
         """Give refinement its turn; whether there is a better plan."""
         plan = self.portfolio.improve(self._cost())
-        better = plan is not None and self.incumbent.offer(plan, self._elapsed())
+        better = plan is not None and self._offer(plan)
         for settled in self.portfolio.settled() if self._uses("adoption") else []:
             self.skeletons.learn(settled)
             if settled.cost < self._tree_cost * (1 - _WORTH_ADOPTING):
