@@ -48,10 +48,15 @@ class Effort:
         }
 
     def next(self, available: Sequence[str]) -> str:
-        """The one of the available activities that is furthest behind its share of the recent work."""
-        whole = sum(self._work.values())
+        """The one of the available activities that is furthest behind its share of the recent work.
+
+        What is not available leaves its share to the others, up to their ceilings.
+        """
         shares = self.shares()
-        return max(available, key=lambda name: shares[name] * whole - self._work[name])
+        whole = sum(shares[name] for name in available)
+        scaled = {name: min(shares[name] / whole, self.ceilings[name]) for name in available}
+        work = sum(self._work[name] for name in available)
+        return max(available, key=lambda name: scaled[name] * work - self._work[name])
 
     def record(self, activity: str, work: float, gain: float) -> None:
         """Note what an activity took (s, or any other measure that is the same for all) and by how much cost fell."""

@@ -52,7 +52,7 @@ _COVER = 3200
 _GROWTH = 1.0
 """Roadmaps grow by at least so many times the square root of their size per iteration: in proportion to their size they
 would grow exponentially, and less and less exploration would fit into a second."""
-_RAREST = 7
+_RAREST = 5
 """Binary logarithm of the longest pause, in iterations, between attempts at skeletons that lead to nothing new."""
 _REWIRINGS = 6
 """Steps that may be validated for rewiring per insertion, once there is a plan."""
@@ -83,7 +83,7 @@ class Options:
     transition_samples: int = 48
     extensions: int = 3
     persistent: float = 0.1
-    refinement_share: float = 0.85
+    refinement_share: float = 0.9
     intra_orbit: str = "tensor-tree"
     without: frozenset[str] = frozenset()
 
@@ -237,6 +237,7 @@ class Planner:
         if self.best is None:
             return "skeletons" if skeletons and self.iteration % _SKELETON_TURN == 0 else "search"
         refine = self._uses("refinement") and not self.portfolio.idle(self._cost())
+        skeletons = skeletons and not (refine and self.portfolio.busy)
         available = ["search", *(["skeletons"] if skeletons else []), *(["refinement"] if refine else [])]
         return self._effort.next(available)
 

@@ -30,6 +30,8 @@ _TRIAL = 5
 """Conic programs that a plan gets before it is compared with the others."""
 _HOPELESS = 1.12
 """Plans that cost so many times the incumbent after their trial wait until nothing else is left to do."""
+_NEARLY = 0.97
+"""A plan whose current iterate costs less than the incumbent times this goes on until it is free of collision."""
 _LATELY, _CRAWL = 5, 0.01
 """Conic programs over which a first round has to gain that share to go on."""
 _ROUNDS = 3
@@ -139,12 +141,20 @@ class Portfolio:
             self._finish(entry)
         return plan
 
+    @property
+    def busy(self) -> bool:
+        """Whether a plan is on trial: until it is over, more plans would only wait."""
+        return any(e.on_trial for e in self._entries)
+
     def idle(self, incumbent: float) -> bool:
         """Whether no plan promises a gain any more."""
         return all(e.done and (e.fruitless >= _ROUNDS or e.cost >= _HOPELESS * incumbent) for e in self._entries)
 
     def _choose(self, incumbent: float) -> _Entry | None:
-        """Plans on trial first, the newest before the others; then the cheapest that goes on; then one to be shaken."""
+        """One that is about to beat the incumbent, else one on trial, the newest first, else one that goes on."""
+        near = [e for e in self._entries if e.optimiser is not None and e.outlook < _NEARLY * incumbent]
+        if near:
+            return min(near, key=lambda e: e.outlook)
         trial = [e for e in self._entries if e.on_trial]
         if trial:
             return trial[-1]
