@@ -118,10 +118,6 @@ class Ways:
                 self.of[key] = [w for w in known if w.stops[-1].after is planned]
         return True
 
-    def forget_placements(self) -> None:
-        """Let other placements of supporting objects be planned from now on."""
-        self._planned.clear()
-
     def _length(self, way: Way) -> float:
         length, last = way.penalty, {r: self._home(r) for s in way.stops for r in s.robots}
         for stop in way.stops:
