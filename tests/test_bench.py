@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 import threading
 import time
 from collections.abc import Callable
+from multiprocessing.popen_spawn_posix import Popen
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +135,23 @@ def test_a_stopped_run_hands_over_what_it_has_when_asked_to(salvage: bool, kept:
     with pytest.raises(Stopped) as stop:
         apart(_interrupt_me, tell=_interrupted, salvage=salvage)
     assert stop.value.run == kept and time.monotonic() - began < 30
+
+
+def test_a_process_that_is_being_made_is_told_what_to_do_before_a_signal_counts(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A signal between the making of the process and the sending of its task leaves no broken process behind."""
+    made = Popen._launch
+
+    def launch(self: Popen, process: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+        made(self, process)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Popen, "_launch", launch)
+    with pytest.raises(KeyboardInterrupt):
+        apart(_fail, tell=lambda text: None)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_progress_appears_after_two_seconds_on_a_stream_that_is_no_terminal() -> None:

@@ -15,7 +15,8 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from multiprocessing import get_context
@@ -261,9 +262,10 @@ def apart(function: Callable[..., Any], *arguments: Any, tell: Tell, salvage: bo
     context = get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs, function, arguments), daemon=True)
-    process.start()
-    theirs.close()
     try:
+        with _uninterrupted():
+            process.start()
+        theirs.close()
         try:
             return _receive(ours, tell)
         except KeyboardInterrupt:
@@ -273,8 +275,32 @@ def apart(function: Callable[..., Any], *arguments: Any, tell: Tell, salvage: bo
             raise Stopped(_receive(ours, tell)) from None
     finally:
         ours.close()
-        process.kill()
-        process.join()
+        if process.pid is not None:
+            process.kill()
+            process.join()
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits for the end of the block, and a process that is made inside it never hears one.
+
+    A process that loses its parent before it has been told what to do would complain with a traceback.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    watched = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda number, _: came.append(number)) for number in watched]
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for number, handler in zip(watched, before, strict=True):
+            signal.signal(number, handler)
+    for late in came:
+        signal.raise_signal(late)
 
 
 def _receive(connection: Connection, tell: Tell) -> Any:

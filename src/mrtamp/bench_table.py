@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import statistics
 import threading
 import time
@@ -11,7 +10,7 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import TextIO
 
-from mrtamp.progress import LOG_PERIOD, TERMINAL_PERIOD
+from mrtamp.progress import LOG_PERIOD, TERMINAL_PERIOD, LastLine
 
 _LOG_AGAIN_S = 10.0
 """Seconds between two lines in a file or a pipe after the first."""
@@ -23,9 +22,8 @@ class Line:
     """The last line of stderr: what is being measured, for how long already; from two seconds on."""
 
     def __init__(self, stream: TextIO, say: Say = print) -> None:
-        self._stream = stream
+        self._line = LastLine(stream)
         self._say = say
-        self._terminal = stream.isatty()
         self._text = ""
         self._shown = ""
         self._lock = threading.Lock()
@@ -41,7 +39,7 @@ class Line:
     ) -> None:
         self._over.set()
         self._thread.join()
-        self._clear()
+        self._line.clear()
 
     def show(self, text: str) -> None:
         """What is going on now."""
@@ -50,35 +48,17 @@ class Line:
     def say(self, text: str) -> None:
         """Print a line of the result."""
         with self._lock:
-            self._clear()
+            self._line.clear()
             self._say(text)
 
     def _run(self) -> None:
         began, due = time.monotonic(), LOG_PERIOD
-        while not self._over.wait(TERMINAL_PERIOD):
+        while not self._over.wait(TERMINAL_PERIOD) and not self._line.gone:
             elapsed = time.monotonic() - began
             if self._text and elapsed >= due:
                 with self._lock:
-                    self._draw(f"{elapsed:6.0f} s  {self._text}")
-                due = elapsed + (TERMINAL_PERIOD if self._terminal else _LOG_AGAIN_S)
-
-    def _draw(self, text: str) -> None:
-        if self._terminal:
-            self._write("\r\x1b[2K" + text[: shutil.get_terminal_size().columns - 1])
-        else:
-            self._write(text + "\n")
-
-    def _clear(self) -> None:
-        if self._terminal:
-            self._write("\r\x1b[2K")
-
-    def _write(self, text: str) -> None:
-        try:
-            self._stream.write(text)
-            self._stream.flush()
-        except (OSError, ValueError):
-            # Whoever read the progress has gone; the measurement matters more.
-            self._over.set()
+                    self._line.draw(f"{elapsed:6.0f} s  {self._text}")
+                due = elapsed + (TERMINAL_PERIOD if self._line.terminal else _LOG_AGAIN_S)
 
 
 # -- numbers ---------------------------------------------------------------------------------------------------------

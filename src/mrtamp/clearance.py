@@ -120,12 +120,11 @@ class Clearance:
         k, t = samples(steps, self.pieces(travel[steps]))
         order = self.rng.permutation(len(k))
         k, t = k[order], t[order]
-        pair, swapped = self.collision.pair(a.roadmap.name, b.roadmap.name)
         for held_a, held_b in dict.fromkeys((a.held[s], b.held[s]) for s in steps.tolist()):
             mine = np.array([a.held[s] is held_a and b.held[s] is held_b for s in k.tolist()])
             for part in _parts(np.flatnonzero(mine)):
-                first, second = (a.at(k[part], t[part]), held_a), (b.at(k[part], t[part]), held_b)
-                hit = pair.first_hit(*second, *first) if swapped else pair.first_hit(*first, *second)
+                qa, qb = a.at(k[part], t[part]), b.at(k[part], t[part])
+                hit = self.collision.first_hit(a.roadmap.name, qa, held_a, b.roadmap.name, qb, held_b)
                 if hit >= 0:
                     return int(k[part][hit])
         return -1

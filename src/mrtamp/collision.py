@@ -245,6 +245,28 @@ class RobotPair:
             scene.write_pose(template, body, X)
         self._template = template
 
+    def rows(
+        self,
+        qa: np.ndarray,
+        held_a: Attachment | None,
+        qb: np.ndarray,
+        held_b: Attachment | None,
+        widths: tuple[float | None, float | None] = (None, None),
+        loads: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
+    ) -> np.ndarray:
+        """Position vectors (N, nq) of the plant; see `first_hit`."""
+        rows = np.repeat(self._template[None], len(qa), axis=0)
+        for i, (q, held) in enumerate(((qa, held_a), (qb, held_b))):
+            in_scene = self.scene.robots[self.worlds[i].name]
+            rows[:, in_scene.arm] = q
+            rows[:, in_scene.fingers] = in_scene.finger_positions(held.width if held else widths[i])
+            if held is not None:
+                known = loads[i]
+                poses = load_poses(self.worlds[i].tool, q, held) if known is None else known
+                k = self.scene.floating[self.slot_of[i][held.object]]
+                rows[:, k : k + 7] = poses
+        return rows
+
     def first_hit(
         self,
         qa: np.ndarray,
@@ -261,16 +283,7 @@ class RobotPair:
         robots may stand: there the shapes count as they are, without padding, which is for motion between samples.
         `loads` are the poses of what is held (N, 7), see `load_poses`, where they are known already.
         """
-        rows = np.repeat(self._template[None], len(qa), axis=0)
-        for i, (q, held) in enumerate(((qa, held_a), (qb, held_b))):
-            in_scene = self.scene.robots[self.worlds[i].name]
-            rows[:, in_scene.arm] = q
-            rows[:, in_scene.fingers] = in_scene.finger_positions(held.width if held else widths[i])
-            if held is not None:
-                known = loads[i]
-                poses = load_poses(self.worlds[i].tool, q, held) if known is None else known
-                k = self.scene.floating[self.slot_of[i][held.object]]
-                rows[:, k : k + 7] = poses
+        rows = self.rows(qa, held_a, qb, held_b, widths, loads)
         plant, context, port = self._plant, self.context, self._port
         lenient = self.tolerance > 0
         for i, row in enumerate(rows):
@@ -329,7 +342,7 @@ def _robot_bounds(scene: Scene, name: str, chain: Chain) -> Bounds:
             continue
         centre, radius = _radius(scene, geometries)
         # The chain shows fingers fully open; they close by at most this much.
-        travel = max(abs(f) for f in gripper.joints.values()) * gripper.max_width if gripper else 0.0
+        travel = max((abs(f) for f in gripper.joints.values()), default=0.0) * gripper.max_width if gripper else 0.0
         extra = travel if body.name() in moving else 0.0
         names.append(body.name())
         centres.append(centre)
@@ -357,3 +370,21 @@ class Collision:
         if (a, b) not in self._pairs:
             self._pairs[a, b] = RobotPair(self.problem, self.worlds[a], self.worlds[b], self.counts)
         return self._pairs[a, b], False
+
+    def first_hit(
+        self,
+        a: str,
+        qa: np.ndarray,
+        held_a: Attachment | None,
+        b: str,
+        qb: np.ndarray,
+        held_b: Attachment | None,
+        widths: tuple[float | None, float | None] = (None, None),
+        exact: np.ndarray | None = None,
+        loads: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
+    ) -> int:
+        """`RobotPair.first_hit` for two robots, whichever comes first in their plant."""
+        pair, swapped = self.pair(a, b)
+        if swapped:
+            return pair.first_hit(qb, held_b, qa, held_a, widths[::-1], exact, loads[::-1])
+        return pair.first_hit(qa, held_a, qb, held_b, widths, exact, loads)

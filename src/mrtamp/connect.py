@@ -111,9 +111,7 @@ class Connector:
     def _apart(
         self, robot: str, q: np.ndarray, held: Attachment | None, other: str, y: np.ndarray, load: Attachment | None
     ) -> bool:
-        pair, swapped = self.validity.collision.pair(robot, other)
-        there = np.tile(y, (len(q), 1))
-        return (pair.first_hit(there, load, q, held) if swapped else pair.first_hit(q, held, there, load)) < 0
+        return self.validity.collision.first_hit(robot, q, held, other, np.tile(y, (len(q), 1)), load) < 0
 
     def _shortened(self, knots: list[np.ndarray], free: Callable[[np.ndarray, np.ndarray], bool]) -> list[np.ndarray]:
         for _ in range(_SHORTCUTS):

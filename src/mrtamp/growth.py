@@ -82,8 +82,8 @@ class Growth:
                 roadmap.add_vertex(robot.home)
             for condition in self.problem.goal:
                 if isinstance(condition, RobotAt) and condition.robot == robot.name:
-                    same = np.flatnonzero(np.max(np.abs(roadmap.q - condition.q), axis=1) == 0)
-                    self.goal_vertices[robot.name] = int(same[0]) if len(same) else roadmap.add_vertex(condition.q)
+                    known = roadmap.find(condition.q)
+                    self.goal_vertices[robot.name] = roadmap.add_vertex(condition.q) if known is None else known
         root = self.tree.add_root(mode, tuple(at), self.graphs.add_orbit(mode))
         self.note_goal(root)
         return root
@@ -102,7 +102,7 @@ class Growth:
             return None
         if self.validity.stand(mode, dict(zip(self.names, node.at, strict=True)), transition.active) is not None:
             return None
-        cost = sum(self.problem.cost.transitions.get(c.kind, 0.0) for c in combination)
+        cost = self.problem.cost.of_changes(c.kind for c in combination)
         known = self.tree.find(mode, node.at)
         after = self.orbits.enter(node, transition, mode, cost)
         if known is None:
@@ -163,7 +163,7 @@ class Growth:
             for i in range(1, segment.length):
                 node = self._insert(node, self._vertices(node, {r: q[i] for r, q in segment.q.items()}))
             if k < len(transitions):
-                cost = sum(self.problem.cost.transitions.get(a.kind, 0.0) for a in transitions[k].actions)
+                cost = self.problem.cost.of_changes(a.kind for a in transitions[k].actions)
                 node = self.orbits.enter(node, transitions[k], segments[k + 1].mode, cost)
         self.orbits.rewirings = rewirings
         if self._is_goal(node) and node not in self.goal_nodes:

@@ -116,9 +116,9 @@ class Insertion:
         state = _State(time, dict(start), root, tuple(range(len(robots))))
         while state.pending:
             ready = self._ready(state, robots, before)
-            targets = self._targets(state, robots, stand, goal)
+            targets = self._targets(state, robots, goal)
             after = None
-            soonest = self._soonest(state, ready, robots, stand)
+            soonest = self._soonest(state, ready, stand)
             for depth in range(_DEPTH + 1):
                 done: list[_State] = []
                 for k in sorted(ready, key=lambda k: soonest[k]):
@@ -153,9 +153,7 @@ class Insertion:
             busy |= set(robots[k])
         return out
 
-    def _targets(
-        self, state: _State, robots: Sequence[Sequence[str]], stand: Stand, goal: Mapping[str, int]
-    ) -> dict[str, int]:
+    def _targets(self, state: _State, robots: Sequence[Sequence[str]], goal: Mapping[str, int]) -> dict[str, int]:
         """Where each robot goes next, as far as that stands on a roadmap already."""
         out = dict(goal)
         for k in reversed(state.pending):
@@ -166,9 +164,7 @@ class Insertion:
                     out[r] = candidate.at[r]
         return out
 
-    def _soonest(
-        self, state: _State, ready: Sequence[int], robots: Sequence[Sequence[str]], stand: Stand
-    ) -> dict[int, float]:
+    def _soonest(self, state: _State, ready: Sequence[int], stand: Stand) -> dict[int, float]:
         """When each stop could happen at the earliest, were its robots alone."""
         out = {}
         for k in ready:

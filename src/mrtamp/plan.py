@@ -111,7 +111,7 @@ def segment_cost(segment: Segment, weights: CostWeights) -> float:
 def plan_cost(segments: list[Segment], transitions: list[Transition], weights: CostWeights) -> float:
     """J of a whole plan (paper, equation 2)."""
     motion = sum(segment_cost(s, weights) for s in segments)
-    changes = sum(weights.transitions.get(a.kind, 0.0) for t in transitions for a in t.actions)
+    changes = weights.of_changes(a.kind for t in transitions for a in t.actions)
     return motion + changes
 
 

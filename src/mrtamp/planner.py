@@ -224,7 +224,7 @@ class Planner:
     def _search(self) -> bool:
         """One iteration of the algorithm's loop; whether there is a better plan."""
         orbit, choices = self._guide()
-        self._expand_roadmaps(orbit)
+        self._expand_roadmaps()
         candidates = self._sample_transitions(orbit, choices)
         for combination in candidates:
             self._discover_adjacent_orbit(orbit, combination)
@@ -343,7 +343,7 @@ class Planner:
 
     # -- sampling -------------------------------------------------------------------------------------------------
 
-    def _expand_roadmaps(self, orbit: int) -> None:
+    def _expand_roadmaps(self) -> None:
         """SampleOrbitInterior and ExpandRoadmaps: every constituent roadmap keeps growing."""
         for name in self.names:
             grown = int(_GROWTH * np.sqrt(self.roadmaps[name].n_vertices))
@@ -460,7 +460,7 @@ class Planner:
         """Grow the sets of ways and realise the cheapest skeletons that may beat the incumbent, until one succeeds."""
         first = self.best is None
         if not first:
-            self._expand_roadmaps(0)
+            self._expand_roadmaps()
         self.skeletons.grow(*(_FIRST_WAYS if first else _MORE_WAYS))
         self.skeletons.update_bound()
         tries = 0

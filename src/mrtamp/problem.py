@@ -7,6 +7,7 @@ notation: `X_WB` is the pose of B in the world W.  Lengths are metres, angles ra
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -271,6 +272,10 @@ class CostWeights:
     makespan: float = 1.0
     path_length: float = 0.01
     transitions: dict[str, float] = field(default_factory=dict)
+
+    def of_changes(self, kinds: Iterable[str]) -> float:
+        """What transitions of these kinds cost together."""
+        return sum(self.transitions.get(kind, 0.0) for kind in kinds)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,6 +29,39 @@ def status_text(status: Status | None, elapsed_s: float) -> str:
     return f"{elapsed_s:6.1f} s  {status.phase}: {', '.join(parts)}"
 
 
+class LastLine:
+    """The last line of a stream: redrawn in place on a terminal, one more line elsewhere.
+
+    Attributes
+    ----------
+    gone : whoever read the stream has left; what is being done matters more.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self.terminal = stream.isatty()
+        self.gone = False
+
+    def draw(self, text: str) -> None:
+        """Show a text in place of the one before."""
+        if self.terminal:
+            self._write("\r\x1b[2K" + text[: shutil.get_terminal_size().columns - 1])
+        else:
+            self._write(text + "\n")
+
+    def clear(self) -> None:
+        """Leave the line empty, where that is possible."""
+        if self.terminal:
+            self._write("\r\x1b[2K")
+
+    def _write(self, text: str) -> None:
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except (OSError, ValueError):
+            self.gone = True
+
+
 class ProgressLine:
     """Shows the latest `Status` of a planner; use it as a context manager and call it with every new status.
 
@@ -36,9 +69,8 @@ class ProgressLine:
     """
 
     def __init__(self, stream: TextIO, *, enabled: bool = True) -> None:
-        self._stream = stream
+        self._line = LastLine(stream)
         self._enabled = enabled
-        self._terminal = stream.isatty()
         self._status: Status | None = None
         self._started = time.monotonic()
         self._over = threading.Event()
@@ -55,25 +87,12 @@ class ProgressLine:
         self._over.set()
         if self._enabled:
             self._thread.join()
-            if self._terminal:
-                self._write("\r\x1b[2K")
+            self._line.clear()
 
     def __call__(self, status: Status) -> None:
         self._status = status
 
     def _run(self) -> None:
-        period = TERMINAL_PERIOD if self._terminal else LOG_PERIOD
-        while not self._over.wait(period):
-            text = status_text(self._status, time.monotonic() - self._started)
-            if self._terminal:
-                self._write("\r\x1b[2K" + text[: shutil.get_terminal_size().columns - 1])
-            else:
-                self._write(text + "\n")
-
-    def _write(self, text: str) -> None:
-        try:
-            self._stream.write(text)
-            self._stream.flush()
-        except (OSError, ValueError):
-            # Whoever read the progress has gone; the plan matters more.
-            self._over.set()
+        period = TERMINAL_PERIOD if self._line.terminal else LOG_PERIOD
+        while not self._over.wait(period) and not self._line.gone:
+            self._line.draw(status_text(self._status, time.monotonic() - self._started))

@@ -176,7 +176,7 @@ class Refiner:
     def _measure(self) -> None:
         self._tracks: dict[str, Track] = {}
         self._lengths = np.array([np.linalg.norm(np.diff(self._q[r], axis=0), axis=1) for r in self.names])
-        changes = sum(self.weights.transitions.get(h.action.kind, 0.0) for h in self._events)
+        changes = self.weights.of_changes(h.action.kind for h in self._events)
         self.cost = self._price(self._lengths) + changes
 
     def _price(self, lengths: np.ndarray) -> float:

@@ -132,6 +132,11 @@ class Roadmap:
             self._samples[e] = known
         return known
 
+    def find(self, q: np.ndarray, tolerance: float = 0.0) -> int | None:
+        """The first vertex at a configuration (n,), every joint within `tolerance` (rad or m); None: there is none."""
+        same = np.flatnonzero(np.max(np.abs(self.q - q), axis=1) <= tolerance)
+        return int(same[0]) if len(same) else None
+
     def samples_between(self, a: np.ndarray, b: np.ndarray) -> int:
         """How many samples of the straight motion a -> b keep every tracked point's steps within the resolution."""
         return samples_between(self.world, self._points, a, b)

@@ -182,10 +182,16 @@ class SkeletonGuidance:
         events = tuple(
             Event(s.kind, {r: np.array([w.stops[i].q[r] for w in ways]) for r in s.robots}) for i, s in enumerate(stops)
         )
-        constant = sum(self.problem.cost.transitions.get(s.kind, 0.0) for s in stops)
+        constant = self.problem.cost.of_changes(s.kind for s in stops)
         penalty = np.array([w.penalty for w in ways]) if penalised else None
         robots = tuple(dict.fromkeys(r for s in stops for r in s.robots))
         return Option(robots, events, constant, penalty)
+
+    def _question(self, sets: Mapping[str, list[list[Way]]], *, penalised: bool) -> tuple:
+        """Tasks, precedence, starts, ends and weights, as the search for skeletons and the bound take them."""
+        tasks = [Task(name, tuple(self._option(w, penalised) for w in ways)) for name, ways in sets.items()]
+        starts = {r.name: r.start for r in self.problem.robots}
+        return tasks, self._precedence(), starts, self._ends(), self.problem.cost
 
     # -- proposals ------------------------------------------------------------------------------------------------
 
@@ -197,14 +203,8 @@ class SkeletonGuidance:
         sets = self._options()
         if sets is None or not self.applies:
             return
-        tasks = [Task(name, tuple(self._option(w, penalised=True) for w in ways)) for name, ways in sets.items()]
-        starts = {r.name: r.start for r in self.problem.robots}
         found = skeletons(
-            tasks,
-            self._precedence(),
-            starts,
-            self._ends(),
-            self.problem.cost,
+            *self._question(sets, penalised=True),
             limit=_LIMIT,
             rng=self.rng,
             distance=self._distance(sets),
@@ -230,8 +230,9 @@ class SkeletonGuidance:
             vertex[robot.name, robot.start.tobytes()] = 0
         for condition in self.problem.goal:
             if isinstance(condition, RobotAt):
-                same = np.flatnonzero(np.max(np.abs(roadmaps[condition.robot].q - condition.q), axis=1) == 0)
-                vertex[condition.robot, condition.q.tobytes()] = int(same[0])
+                goal = roadmaps[condition.robot].find(condition.q)
+                assert goal is not None
+                vertex[condition.robot, condition.q.tobytes()] = goal
 
         def distance(robot: str, A: np.ndarray, B: np.ndarray) -> np.ndarray:
             rows, columns = ([vertex[robot, q.tobytes()] for q in X] for X in (A, B))
@@ -269,10 +270,7 @@ class SkeletonGuidance:
         sets = self._options()
         if sets is None or not self.applies:
             return
-        tasks = [Task(name, tuple(self._option(w, penalised=False) for w in ways)) for name, ways in sets.items()]
-        starts = {r.name: r.start for r in self.problem.robots}
-        distance = self._distance(sets)
-        bound = lower_bound(tasks, self._precedence(), starts, self._ends(), self.problem.cost, distance=distance)
+        bound = lower_bound(*self._question(sets, penalised=False), distance=self._distance(sets))
         self.bound = bound.value if bound.value < FAR else None
 
     def failed(self, way: Way) -> None:

@@ -134,12 +134,11 @@ class Clearances:
         if gap.min() > _NEAR:
             return True
         n = self._samples([(one, a), (two, b)]) if (a.a, b.a) != (a.b, b.b) else 1
-        first, second = ((two, b, held_b), (one, a, held_a)), ((one, a, held_a), (two, b, held_b))
-        pair, swapped = self.collision.pair(one, two)
-        (q, load), (q2, load2) = (self._along(*x, n) for x in (first if swapped else second))
+        qa, load_a = self._along(one, a, held_a, n)
+        qb, load_b = self._along(two, b, held_b, n)
         ends = np.arange(n)[bisection_order(n)] % max(n - 1, 1) == 0
-        held = (held_b, held_a) if swapped else (held_a, held_b)
-        return pair.first_hit(q, held[0], q2, held[1], exact=ends, loads=(load, load2)) < 0
+        hit = self.collision.first_hit(one, qa, held_a, two, qb, held_b, exact=ends, loads=(load_a, load_b))
+        return hit < 0
 
     def _along(self, robot: str, move: Move, held: Attachment | None, n: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Samples (n, dof) of a move in bisection order, and the poses of the load there."""

@@ -102,7 +102,7 @@ class _SubgoalReader:
         entries = value.mapping(("object", "to"))
         thing = entries["object"].choice(self.frames.objects, "objects")
         to = entries["to"]
-        if to.data in self.robots and to.data not in targets:
+        if isinstance(to.data, str) and to.data in self.robots and to.data not in targets:
             raise to.error(
                 f"found {to.data!r}, which is not at this subgoal, {choices(targets, None, 'robots of the subgoal')}"
             )

@@ -244,12 +244,9 @@ class Validity:
         if opposed:
             qb = qb[::-1]
         close = close[bisection_order(len(close))]
-        pair, swapped = self.collision.pair(a, b)
         # Robots may stand at the ends of an edge: no padding there.
         exact = (close == 0) | (close == n - 1)
-        if swapped:
-            return pair.first_hit(qb[close], held_b, qa[close], held_a, exact=exact) < 0
-        return pair.first_hit(qa[close], held_a, qb[close], held_b, exact=exact) < 0
+        return self.collision.first_hit(a, qa[close], held_a, b, qb[close], held_b, exact=exact) < 0
 
     def stand(self, mode: Mode, at: Mapping[str, int], robots: tuple[str, ...]) -> str | None:
         """None if `robots` may stand at their vertices among all others in `mode`; else who is in the way."""

@@ -150,18 +150,17 @@ class FineCheck:
         still = np.concatenate([[False], np.all(x[a][1:] == x[a][:-1], axis=1) & np.all(x[b][1:] == x[b][:-1], axis=1)])
         same = np.concatenate([[False], np.diff(samples.segment) == 0])
         close = close[~(still & same)[close]]
-        pair, swapped = self.nearness.collision.pair(a, b)
+        collision = self.nearness.collision
         hits: list[int] = []
         for s in np.unique(samples.segment[close]).tolist():
             i = close[samples.segment[close] == s]
             held_a, held_b = (arrangement.modes[s].held.get(r) for r in (a, b))
             lo, t = samples.lo[i], samples.t[i]
             exact = (t == 0) | (t == 1) | tight[lo] | tight[np.minimum(lo + 1, len(tight) - 1)]
-            one, two = (x[a][i], held_a), (x[b][i], held_b)
-            first, second = (two, one) if swapped else (one, two)
+            qa, qb = x[a][i], x[b][i]
 
             def ask(k: np.ndarray) -> int:
-                return pair.first_hit(first[0][k], first[1], second[0][k], second[1], exact=exact[k])  # noqa: B023
+                return collision.first_hit(a, qa[k], held_a, b, qb[k], held_b, exact=exact[k])  # noqa: B023
 
             hits += i[_all_hits(ask, np.arange(len(i)))].tolist()
         return np.array(sorted(hits), dtype=int)

@@ -14,7 +14,7 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
-from mrtamp.collision import Collision, write_held
+from mrtamp.collision import Collision
 from mrtamp.modes import Attachment, Mode
 from mrtamp.optimise.choices import Arrangement
 from mrtamp.optimise.screws import cross, joint_screws, transported, upstream
@@ -247,15 +247,8 @@ class Nearness:
     def pair_rows(self, a: str, b: str, qa: np.ndarray, qb: np.ndarray, mode: Mode) -> np.ndarray:
         """Positions of the plant of two robots."""
         pair, swapped = self.collision.pair(a, b)
-        rows = np.repeat(pair._template[None], len(qa), axis=0)
-        own = ((b, qb), (a, qa)) if swapped else ((a, qa), (b, qb))
-        for i, (name, q) in enumerate(own):
-            in_scene, held = pair.scene.robots[name], mode.held.get(name)
-            rows[:, in_scene.arm] = q
-            rows[:, in_scene.fingers] = in_scene.finger_positions(held.width if held else None)
-            if held is not None:
-                write_held(pair.scene, rows, pair.slot_of[i][held.object], pair.worlds[i].tool, q, held)
-        return rows
+        one, two = (qa, mode.held.get(a)), (qb, mode.held.get(b))
+        return pair.rows(*two, *one) if swapped else pair.rows(*one, *two)
 
     def between(
         self,

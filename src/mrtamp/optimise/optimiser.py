@@ -110,7 +110,7 @@ class Optimiser:
         self._worth = np.inf
         self._promise = 0.0
         self.collisions = Collisions(self.nearness, problem.collision.tolerance)
-        self._changes = sum(self.weights.transitions.get(a.kind, 0.0) for t in transitions for a in t.actions)
+        self._changes = self.weights.of_changes(a.kind for t in transitions for a in t.actions)
         self.choices = Choices(problem, [s.mode for s in segments], transitions, families if slide else {})
         if not slide:
             self.choices.freeze()

@@ -150,7 +150,7 @@ class ContactBuilder:
                 if world.first_hit(rows) >= 0:
                     self._blame(stats, world.culprits(rows[0]), {world.name, *world.slot_of.values()})
                     return None
-        pair, swapped = self.workspace.collision.pair(giver, receiver)
+        collision = self.workspace.collision
         # The receiver's fingers close before the giver's open; both are looked at on their way.
         stages: list[tuple[Attachment | None, Attachment | None, tuple[float | None, float | None]]] = [
             (given, None, (None, None)),
@@ -162,8 +162,7 @@ class ContactBuilder:
         def apart(
             a: np.ndarray, ha: Attachment | None, b: np.ndarray, hb: Attachment | None, w: tuple = (None, None)
         ) -> bool:
-            hit = pair.first_hit(b, hb, a, ha, w[::-1]) if swapped else pair.first_hit(a, ha, b, hb, w)
-            return hit < 0
+            return collision.first_hit(giver, a, ha, receiver, b, hb, w) < 0
 
         if not all(apart(qa[None], ha, qb[None], hb, widths) for ha, hb, widths in stages):
             stats.collisions["each other"] += 1

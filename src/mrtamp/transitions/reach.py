@@ -178,8 +178,8 @@ class ReachSampler:
             if world.first_hit(rows) >= 0:
                 stats.collisions.update(b for pair in world.culprits(rows[0]) for b in pair if b != robot)
                 continue
-            same = np.flatnonzero(np.max(np.abs(roadmap.q - x), axis=1) < _SAME)
-            fresh.append(int(same[0]) if len(same) else roadmap.add_vertex(x))
+            known_vertex = roadmap.find(x, _SAME)
+            fresh.append(roadmap.add_vertex(x) if known_vertex is None else known_vertex)
             self._note_contact(name, robot, fresh[-1])
             if len(fresh) == keep:
                 break

@@ -196,8 +196,8 @@ class Ways:
         key = (item, (giver, receiver))
         self.tries[key] = self.tries.get(key, 0) + 1
         start = sampler.validity.world_pose(mode.chain(item))[:3, 3]
-        goals = self._goal_places(mode, item, chains)
-        if not goals or not self._near(receiver, goals) or not sampler.in_reach(giver, start):
+        places = self._goal_places(mode, item, chains)
+        if not places or not self._near(receiver, places) or not sampler.in_reach(giver, start):
             return []
         picks = sampler.picks(mode, giver, item) or sampler.sample_pick(mode, giver, item, n)
         picks = [p for p in picks if p.promising] or picks
@@ -207,7 +207,6 @@ class Ways:
             for handover in sampler.sample_handover(held, giver, receiver, n):
                 assert handover.after is not None
                 taken = handover.after
-                places = self._goal_places(mode, item, chains)
                 qb = sampler.roadmaps[receiver].q[handover.at[receiver]]
                 m = _AFTER
                 q2, which, poses, solved = self._places(receiver, [taken] * m, np.tile(qb, (m, 1)), places)
