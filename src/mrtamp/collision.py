@@ -75,8 +75,8 @@ def _slots(problem: Problem, prefix: str) -> tuple[dict[str, MovableObject], dic
     return slots, slot_of
 
 
-def _radius(scene: Scene, body_geometries: Sequence) -> tuple[np.ndarray, float]:
-    """A sphere, in the body frame, around some collision geometries of one body."""
+def geometry_bound(scene: Scene, body_geometries: Sequence) -> tuple[np.ndarray, float]:
+    """Centre (3,) in the body frame and radius (m) of a sphere around some collision geometries of one body."""
     inspector = scene.scene_graph.model_inspector()
     corners = []
     for g in body_geometries:
@@ -327,7 +327,7 @@ def _owners(scene: Scene) -> dict:
 
 def _body_radius(scene: Scene, name: str) -> float:
     """Radius (m) around the body's origin that holds a free body."""
-    centre, radius = _radius(scene, geometry_ids(scene.plant, scene.free_bodies[name]))
+    centre, radius = geometry_bound(scene, geometry_ids(scene.plant, scene.free_bodies[name]))
     return float(np.linalg.norm(centre)) + radius
 
 
@@ -338,9 +338,9 @@ def _robot_bounds(scene: Scene, name: str, chain: Chain) -> Bounds:
     names, centres, radii = [], [], []
     for body in robot_bodies(scene.plant, in_scene):
         geometries = scene.plant.GetCollisionGeometriesForBody(body)
-        if not geometries or body.name() not in chain._index:
+        if not geometries or body.name() not in chain.index:
             continue
-        centre, radius = _radius(scene, geometries)
+        centre, radius = geometry_bound(scene, geometries)
         # The chain shows fingers fully open; they close by at most this much.
         travel = max((abs(f) for f in gripper.joints.values()), default=0.0) * gripper.max_width if gripper else 0.0
         extra = travel if body.name() in moving else 0.0

@@ -8,6 +8,7 @@ translation `p` (N, 3), expressed in the world W.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,17 +119,17 @@ class Chain:
         self.velocity = np.empty(self.n)
         self.prismatic = np.zeros(self.n, dtype=bool)
         self.bodies: list[str] = [base]
-        self._links = [_Link(-1, X_WB.rotation().matrix(), X_WB.translation(), "weld", -1, np.eye(3), np.zeros(3))]
+        self.links = [_Link(-1, X_WB.rotation().matrix(), X_WB.translation(), "weld", -1, np.eye(3), np.zeros(3))]
         joints = [plant.get_joint(j) for j in plant.GetJointIndices(instance)]
-        self._index = {base: 0}
+        self.index = {base: 0}
         pending = [j for j in joints if j.child_body().name() != base]
         while pending:
-            ready = [j for j in pending if j.parent_body().name() in self._index]
+            ready = [j for j in pending if j.parent_body().name() in self.index]
             if not ready:
                 break
             for joint in ready:
                 self._append(joint, arm_joints, fixed)
-            pending = [j for j in pending if j.child_body().name() not in self._index]
+            pending = [j for j in pending if j.child_body().name() not in self.index]
         missing = [name for name in arm_joints if not any(j.name() == name for j in joints)]
         if missing:
             raise MrtampError(f"arm joints {missing} do not exist; the model has {[j.name() for j in joints]}")
@@ -168,24 +169,26 @@ class Chain:
             raise MrtampError(
                 f"joint {joint.name()} is of type {kind}; arms may have revolute, prismatic and fixed joints"
             )
-        self._index[joint.child_body().name()] = len(self._links)
+        self.index[joint.child_body().name()] = len(self.links)
         self.bodies.append(joint.child_body().name())
-        parent = self._index[joint.parent_body().name()]
-        self._links.append(_Link(parent, R, p, kind, column, R_after, p_after))
+        parent = self.index[joint.parent_body().name()]
+        self.links.append(_Link(parent, R, p, kind, column, R_after, p_after))
 
     def poses(self, q: Array, bodies: list[str] | None = None) -> tuple[Array, Array]:
         """World poses of `bodies` (default: all): R (B, N, 3, 3), p (B, N, 3) for configurations q (N, n)."""
-        Rs, ps, _ = self._sweep(q)
-        rows = range(len(self._links)) if bodies is None else [self._index[b] for b in bodies]
+        Rs, ps, _ = self.sweep(q)
+        rows = range(len(self.links)) if bodies is None else [self.index[b] for b in bodies]
         return np.stack([Rs[i] for i in rows]), np.stack([ps[i] for i in rows])
 
-    def _sweep(self, q: Array) -> tuple[list[Array], list[Array], list[tuple[int, Array, Array]]]:
+    def sweep(self, q: Array) -> tuple[list[Array], list[Array], list[tuple[int, Array, Array]]]:
+        """Rotations (N, 3, 3) and translations (N, 3) of all bodies in W at q (N, n), and every joint's column, axis
+        (N, 3) and a point (N, 3) on that axis."""
         N = len(q)
         cos, sin = np.cos(q), np.sin(q)
         Rs: list[Array] = []
         ps: list[Array] = []
         axes: list[tuple[int, Array, Array]] = []
-        for link in self._links:
+        for link in self.links:
             if link.parent < 0:
                 R, p = np.broadcast_to(link.R, (N, 3, 3)), np.broadcast_to(link.p, (N, 3))
             else:
@@ -216,18 +219,23 @@ class Tool:
         self.chain = chain
         self._R = X_BG.rotation().matrix()
         self._p = X_BG.translation()
-        self._body = chain._index[body]
+        self._body = chain.index[body]
         # Only the links between base and tool are swept.
         path, i = [], self._body
         while i >= 0:
             path.append(i)
-            i = chain._links[i].parent
+            i = chain.links[i].parent
         self._arm = _sub_chain(chain, path[::-1])
 
     def pose(self, q: Array) -> tuple[Array, Array]:
         """R_WG (N, 3, 3) and p_WG (N, 3) at q (N, n)."""
-        Rs, ps, _ = self._arm._sweep(q)
+        Rs, ps, _ = self._arm.sweep(q)
         return Rs[-1] @ self._R, ps[-1] + Rs[-1] @ self._p
+
+    def carried(self, Rs: Sequence[Array], ps: Sequence[Array]) -> tuple[Array, Array]:
+        """R_WG (N, 3, 3) and p_WG (N, 3) from the poses of all bodies, as `Chain.sweep` returns them."""
+        R, p = Rs[self._body], ps[self._body]
+        return R @ self._R, p + R @ self._p
 
     def matrix(self, q: Array) -> Array:
         """X_WG (N, 4, 4) at q (N, n)."""
@@ -235,7 +243,7 @@ class Tool:
 
     def jacobian(self, q: Array) -> tuple[Array, Array, Array]:
         """R_WG, p_WG and the geometric Jacobian J (N, 6, n): rows are angular, then translational velocity in W."""
-        Rs, ps, axes = self._arm._sweep(q)
+        Rs, ps, axes = self._arm.sweep(q)
         R, p = Rs[-1] @ self._R, ps[-1] + Rs[-1] @ self._p
         J = np.zeros((len(q), 6, self.chain.n))
         for column, axis, origin in axes:
@@ -256,7 +264,7 @@ def _sub_chain(chain: Chain, path: list[int]) -> Chain:
     arm.n = chain.n
     links: list[_Link] = []
     for i in path:
-        link = chain._links[i]
+        link = chain.links[i]
         copy = _Link(len(links) - 1, link.R, link.p, link.kind, link.column, link.R_after, link.p_after)
         if link.kind == "weld" and links:
             last = links[-1]
@@ -268,5 +276,5 @@ def _sub_chain(chain: Chain, path: list[int]) -> Chain:
                 last.R_after = last.R_after @ link.R
             continue
         links.append(copy)
-    arm._links = links
+    arm.links = links
     return arm

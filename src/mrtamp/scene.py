@@ -326,11 +326,12 @@ def _pad(
     return out
 
 
-def chain_of(scene: Scene, name: str) -> tuple[Chain, Tool]:
-    """Batched kinematics of robot `name` with open fingers, and its grasp frame."""
+def chain_of(scene: Scene, name: str, width: float | None = None) -> tuple[Chain, Tool]:
+    """Batched kinematics of robot `name` with its hand `width` (m) open (None: fully), and its grasp frame."""
     in_scene = scene.robots[name]
     model = in_scene.robot.model
     gripper = model.gripper
-    fixed = {j: f * gripper.max_width for j, f in gripper.joints.items()} if gripper else {}
+    opening = gripper.max_width if gripper and width is None else width
+    fixed = {j: f * opening for j, f in gripper.joints.items()} if gripper and opening is not None else {}
     chain = Chain(scene.plant, in_scene.instance, model.base, in_scene.robot.X_WB, model.arm_joints, fixed)
     return chain, Tool(chain, model.grasp_body, model.X_BG)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
-from mrtamp.collision import PADDING
 from mrtamp.optimise.choices import Arrangement
 from mrtamp.optimise.fine import Violations, Who, contact_of, knot_samples
 from mrtamp.optimise.nearness import Near, Nearness, Samples, State
@@ -35,21 +34,44 @@ _PARTS = 24
 
 @dataclass(frozen=True, eq=False)
 class CollisionRows:
-    """Linearised distances: A (P, K * N + coordinates), and how far (P,) each may shrink.
+    """Linearised distances: A (P, K * N + coordinates) of `distance` (P,), and the clearance `asked` (P,) of each.
 
-    `deepest` is the largest penetration (m) beyond what is allowed, `clearance` the least distance (K - 1, 3) at the
-    beginning, the middle and the end of every step, as far as it is less than what enters the program.
+    Where robots stand, shapes count without `padding` (P,); `padded` (P,) are those of which more clearance may be
+    asked.  `clearance` is the least distance (K - 1, 3) at the beginning, the middle and the end of every step, as far
+    as it is less than what enters the program.
     """
 
     A: sparse.csr_array
-    gap: np.ndarray
-    deepest: float
+    distance: np.ndarray
+    asked: np.ndarray
+    padding: np.ndarray
+    padded: np.ndarray
     clearance: dict[Who, np.ndarray]
+
+    @property
+    def gap(self) -> np.ndarray:
+        """How far (P,) each may shrink."""
+        return self.distance - self.asked
+
+    def deepest(self, tolerance: float) -> float:
+        """The largest penetration (m) beyond what is allowed."""
+        if not len(self.distance):
+            return 0.0
+        allowed = np.minimum(self.asked, 0) - self.padding
+        return max(0.0, float((allowed - self.distance).max()) - tolerance)
 
     def joined(self, other: CollisionRows) -> CollisionRows:
         """These rows and others."""
         A = sparse.csr_array(sparse.vstack([self.A, other.A]))
-        return CollisionRows(A, np.concatenate([self.gap, other.gap]), max(self.deepest, other.deepest), self.clearance)
+        distance, asked, padding, padded = (
+            np.concatenate([getattr(x, name) for x in (self, other)])
+            for name in ("distance", "asked", "padding", "padded")
+        )
+        return CollisionRows(A, distance, asked, padding, padded, self.clearance)
+
+    def stricter(self, by: float) -> CollisionRows:
+        """The same with `by` (m) more clearance asked for."""
+        return replace(self, asked=self.asked + by * self.padded)
 
 
 class Collisions:
@@ -61,13 +83,14 @@ class Collisions:
         self.level = 0
         self.pad = 0.0
         """Clearance (m) that is asked for everywhere on top, to come free of collision between samples too."""
-        self._demands: Demands = {}
+        self.demands: Demands = {}
+        """Where more clearance is asked for; steps are those of the polyline at hand."""
 
     # -- demands ----------------------------------------------------------------------------------------------------
 
     def forget(self) -> None:
         """Ask for no more than everywhere."""
-        self._demands = {}
+        self.demands = {}
 
     def learn(self, violations: Sequence[Violations]) -> Demands:
         """Every violating sample becomes a row of the next programs, stricter each time it recurs; returns them."""
@@ -75,12 +98,12 @@ class Collisions:
         for v in violations:
             for lo, t, s in zip(v.samples.lo.tolist(), v.samples.t.tolist(), v.samples.segment.tolist(), strict=True):
                 key = self.demand(v.who, lo, t, s)
-                fresh.setdefault(v.who, {})[key] = self._demands[v.who][key]
+                fresh.setdefault(v.who, {})[key] = self.demands[v.who][key]
         return fresh
 
     def demand(self, who: Who, lo: int, t: float, segment: int, depth: float = 0.0) -> tuple[int, float, int]:
         """Ask for more clearance at one place, where the penetration was `depth` (m)."""
-        rows = self._demands.setdefault(who, {})
+        rows = self.demands.setdefault(who, {})
         key = (lo, round(t * _PARTS) / _PARTS, segment)
         rows[key] = rows.get(key, 0) + 1 + int(np.ceil(depth / _STRICTER))
         return key
@@ -88,13 +111,13 @@ class Collisions:
     def move(self, u: np.ndarray) -> None:
         """The polyline now has knots at parameters u of the one before."""
         moved: Demands = {}
-        for who, rows in self._demands.items():
+        for who, rows in self.demands.items():
             moved[who] = {}
             for (lo, t, segment), strict in rows.items():
                 at = float(np.interp(lo + t, u, np.arange(len(u))))
                 k = min(int(at), max(len(u) - 2, 0))
                 moved[who][k, round((at - k) * _PARTS) / _PARTS, segment] = strict
-        self._demands = moved
+        self.demands = moved
 
     def _samples(self, n: int, extra: Mapping[tuple[int, float, int], int]) -> tuple[Samples, np.ndarray]:
         """The samples demanded, and the clearance asked for at n common ones and at each of them."""
@@ -110,7 +133,7 @@ class Collisions:
 
     def rows(self, line: Polyline, q: np.ndarray, arrangement: Arrangement) -> CollisionRows:
         """Distances and their gradients at knots, midpoints, and wherever they were demanded, at knots q (K, N)."""
-        return self._rows(line, q, arrangement, knot_samples(line, np.full(line.knots - 1, 2)), self._demands)
+        return self._rows(line, q, arrangement, knot_samples(line, np.full(line.knots - 1, 2)), self.demands)
 
     def more(self, line: Polyline, q: np.ndarray, arrangement: Arrangement, demands: Demands) -> CollisionRows:
         """The same at some demanded places only."""
@@ -120,8 +143,7 @@ class Collisions:
         self, line: Polyline, q: np.ndarray, arrangement: Arrangement, base: Samples, demands: Demands
     ) -> CollisionRows:
         blocks: list[sparse.csr_array] = [sparse.csr_array((0, q.size + len(arrangement.c)))]
-        gaps: list[np.ndarray] = [np.zeros(0)]
-        deepest = 0.0
+        parts: list[tuple[np.ndarray, ...]] = [(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))]
         clearance: dict[Who, np.ndarray] = {}
         names, ask = list(line.columns), self.nearness
         knots = {r: q[:, c] for r, c in line.columns.items()}
@@ -137,30 +159,18 @@ class Collisions:
                     states = {r: common[r].joined(more[r]) for r in who}
                 if other is None:
                     near = ask.world(robot, states[robot], samples, arrangement, _NEAR)
-                    asked = np.where(self._touching(line, robot, samples, near), _TOUCHING, margin[near.sample])
+                    touching = ask.touching(robot, contact_of(line.stretches, robot, samples), near)
                 else:
                     pair = (states[other], states[robot])
                     near = ask.between((other, robot), pair, samples, arrangement, _NEAR)
-                    asked = margin[near.sample]
+                    touching = np.zeros(len(near.distance), dtype=bool)
                 clearance[who] = _clearance(line, base, near)
                 if len(near.distance):
-                    # Where robots stand, their shapes count without padding.
-                    allowed = np.minimum(asked, 0) - (0.0 if other is None else 2 * PADDING)
-                    deepest = max(deepest, float((allowed - near.distance).max()) - self.tolerance)
+                    asked = np.where(touching, _TOUCHING, margin[near.sample])
                     blocks.append(self.gradient(line, samples, near, states, arrangement))
-                    gaps.append(near.distance - asked)
-        return CollisionRows(sparse.csr_array(sparse.vstack(blocks)), np.concatenate(gaps), deepest, clearance)
-
-    def _touching(self, line: Polyline, robot: str, samples: Samples, near: Near) -> np.ndarray:
-        """Pairs (P,) of a load and what it is being lifted off or put on."""
-        number = self.nearness.carriers.number
-        numbers = {"": -2}
-        contact = contact_of(line.stretches, robot, samples)
-        for name in set(contact) - {""}:
-            numbers[name] = number.get(("static", name), number.get(("object", name), -2))
-        support = np.array([numbers[c] for c in contact], dtype=int)[near.sample]
-        held = number["held", robot]
-        return ((near.a == held) & (near.b == support)) | ((near.b == held) & (near.a == support))
+                    parts.append((near.distance, asked, near.padding, ~touching))
+        distance, wanted, padding, padded = (np.concatenate(x) for x in zip(*parts, strict=True))
+        return CollisionRows(sparse.csr_array(sparse.vstack(blocks)), distance, wanted, padding, padded, clearance)
 
     def gradient(
         self, line: Polyline, samples: Samples, near: Near, states: Mapping[str, State], arrangement: Arrangement

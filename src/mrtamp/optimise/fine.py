@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from mrtamp.collision import RESOLUTION
+from mrtamp.collision import CONTACT_DEPTH, RESOLUTION
 from mrtamp.optimise.choices import Arrangement
-from mrtamp.optimise.nearness import CULL, Nearness, Samples
+from mrtamp.optimise.nearness import Near, Nearness, Samples, State
 from mrtamp.optimise.polyline import Polyline, Stretch
 
 _SLIVER = 1e-9
 _QUARTERS = np.array([0.25, 0.5, 0.75])
+_AROUND = np.array([-0.75, -0.5, -0.25, 0.25, 0.5, 0.75])
+_CLOSE = 1.5e-3
+"""Distance (m) at which samples in between are looked at again more closely."""
 _SWERVE = 1.3
 """By how much more than tracked points any other may move."""
 
@@ -48,6 +51,7 @@ class FineCheck:
 
     def __init__(self, nearness: Nearness, resolution: float = RESOLUTION) -> None:
         self.nearness = nearness
+        self.tolerance = nearness.collision.problem.collision.tolerance
         self.resolution = resolution
 
     def _travel(self, line: Polyline, q: np.ndarray) -> dict[str, np.ndarray]:
@@ -62,13 +66,17 @@ class FineCheck:
             out[robot] = np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1)
         return out
 
+    def _pieces(self, travel: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Into how many pieces (K - 1,) every step is cut."""
+        furthest = np.max(list(travel.values()), axis=0)
+        return np.maximum(1, np.ceil(1.1 * furthest / self.resolution)).astype(int)
+
     def _samples(self, line: Polyline, travel: Mapping[str, np.ndarray], between: bool) -> Samples:
         """Samples between which no tracked point of any robot moves further than the resolution, transitions twice.
 
         With `between`, three samples in between any two of those.
         """
-        furthest = np.max(list(travel.values()), axis=0)
-        pieces = np.maximum(1, np.ceil(1.1 * furthest / self.resolution)).astype(int)
+        pieces = self._pieces(travel)
         if not between:
             return knot_samples(line, pieces)
         lo = np.repeat(np.arange(line.knots - 1), 3 * pieces)
@@ -84,7 +92,7 @@ class FineCheck:
         clearance: Mapping[Who, np.ndarray],
         between: bool = False,
     ) -> list[Violations]:
-        """All samples in collision; with `between`, of the samples in between the others.
+        """All samples in collision; with `between`, of the samples in between the others, and more of a close call.
 
         Next to knots (K,) at which both of two robots are `pinned`, their shapes count without padding.  `clearance`
         are distances (K - 1, 3) at the beginning, the middle and the end of every step: nothing that is further apart
@@ -93,77 +101,93 @@ class FineCheck:
         travel = self._travel(line, q)
         samples = self._samples(line, travel, between)
         names = list(line.columns)
-        out = []
+        doubtful: dict[Who, np.ndarray] = {}
         for i, robot in enumerate(names):
             for other in (None, *names[:i]):
                 who: Who = (robot,) if other is None else (other, robot)
                 moved = np.sum([travel[r] for r in who], axis=0)
-                mine = samples[_doubtful(line, samples, clearance[who], moved)]
-                if not len(mine):
-                    continue
-                x = {r: mine.at(q[:, line.columns[r]]) for r in who}
-                spheres = {r: self.nearness.spheres(r, x[r], arrangement.modes, mine.segment) for r in who}
-                if other is None:
-                    hits = self._world(line, robot, x[robot], mine, arrangement, spheres[robot])
-                else:
-                    hits = self._pair(other, robot, x, mine, arrangement, spheres, pinned[other] & pinned[robot])
-                if len(hits):
-                    out.append(Violations(who, mine[hits]))
+                doubtful[who] = _doubtful(line, samples, clearance[who], moved)
+        x = {r: samples.at(q[:, line.columns[r]]) for r in names}
+        still = {r: _still(x[r], samples) for r in names}
+        states: dict[str, tuple[np.ndarray, State]] = {}
+        for robot in names:
+            used = np.unique(np.concatenate([mine for who, mine in doubtful.items() if robot in who]))
+            states[robot] = (
+                used,
+                self.nearness.state(robot, q[:, line.columns[robot]], samples[used], arrangement.modes),
+            )
+        out = []
+        for who, all_of_them in doubtful.items():
+            # Who stands still is looked at once.
+            mine = all_of_them[~np.all([still[r][all_of_them] for r in who], axis=0)]
+            if not len(mine):
+                continue
+            self.nearness.collision.counts.collision_checks += len(mine)
+            at = [state.of(np.searchsorted(used, mine)) for used, state in (states[r] for r in who)]
+            if len(who) == 1:
+                hits, suspects = self._world(line, who[0], at[0], samples[mine], arrangement)
+                if between and not len(hits) and len(suspects):
+                    found = self._around(line, q, who[0], samples[mine[suspects]], arrangement, travel)
+                    out += [Violations(who, found)] if len(found) else []
+            else:
+                hits = self._pair(who, (at[0], at[1]), samples[mine], arrangement, pinned[who[0]] & pinned[who[1]])
+            if len(hits):
+                out.append(Violations(who, samples[mine[hits]]))
         return out
 
     def _world(
-        self, line: Polyline, robot: str, x: np.ndarray, samples: Samples, arrangement: Arrangement, spheres: tuple
-    ) -> np.ndarray:
-        world = self.nearness.worlds[robot]
-        contact = contact_of(line.stretches, robot, samples)
-        hits: list[int] = []
-        for s in np.unique(samples.segment).tolist():
-            mode = arrangement.modes[s]
-            held = mode.held.get(robot)
-            slot = world.slot_of[held.object] if held else None
-            here = np.flatnonzero(samples.segment == s)
-            # Who stands still is looked at once.
-            fresh = np.concatenate([[True], np.abs(np.diff(x[here], axis=0)).max(axis=1) > 0])
-            here = here[fresh]
-            rows = self.nearness.rows(
-                robot, x[here], held, arrangement.resting(mode), (spheres[0][here], spheres[1][here]), CULL
-            )
-            for touch in set(contact[here]):
-                mine = np.flatnonzero(contact[here] == touch)
-                found = here[mine[_all_hits(lambda r: world.first_hit(r, touch or None, slot), rows[mine])]]  # noqa: B023
-                hits += found.tolist()
-        return np.array(sorted(hits), dtype=int)
+        self, line: Polyline, robot: str, state: State, samples: Samples, arrangement: Arrangement
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Samples in collision, and samples so close to it that those around them are worth a look."""
+        near = self.nearness.world(robot, state, samples, arrangement, _CLOSE)
+        touching = self.nearness.touching(robot, contact_of(line.stretches, robot, samples), near)
+        depth = np.where(touching & (near.distance >= -CONTACT_DEPTH), 0.0, -near.distance)
+        return self._refused(near, depth, len(samples)), np.unique(near.sample[~touching])
+
+    def _around(
+        self,
+        line: Polyline,
+        q: np.ndarray,
+        robot: str,
+        samples: Samples,
+        arrangement: Arrangement,
+        travel: Mapping[str, np.ndarray],
+    ) -> Samples:
+        """What is in collision around samples of which every fourth was checked at the resolution."""
+        pieces = self._pieces(travel)[samples.lo]
+        t = (samples.t[:, None] + _AROUND / (4 * pieces[:, None])).ravel()
+        inside = (t >= 0) & (t <= 1)
+        repeat = len(_AROUND)
+        more = Samples(np.repeat(samples.lo, repeat), t, np.repeat(samples.segment, repeat))[inside]
+        self.nearness.collision.counts.collision_checks += len(more)
+        state = self.nearness.state(robot, q[:, line.columns[robot]], more, arrangement.modes)
+        return more[self._world(line, robot, state, more, arrangement)[0]]
 
     def _pair(
         self,
-        a: str,
-        b: str,
-        x: dict[str, np.ndarray],
+        who: Who,
+        states: tuple[State, State],
         samples: Samples,
         arrangement: Arrangement,
-        spheres: dict,
         tight: np.ndarray,
     ) -> np.ndarray:
-        close = self.nearness.close((spheres[a], spheres[b]), CULL)
-        if not len(close):
-            return close
-        still = np.concatenate([[False], np.all(x[a][1:] == x[a][:-1], axis=1) & np.all(x[b][1:] == x[b][:-1], axis=1)])
-        same = np.concatenate([[False], np.diff(samples.segment) == 0])
-        close = close[~(still & same)[close]]
-        collision = self.nearness.collision
-        hits: list[int] = []
-        for s in np.unique(samples.segment[close]).tolist():
-            i = close[samples.segment[close] == s]
-            held_a, held_b = (arrangement.modes[s].held.get(r) for r in (a, b))
-            lo, t = samples.lo[i], samples.t[i]
-            exact = (t == 0) | (t == 1) | tight[lo] | tight[np.minimum(lo + 1, len(tight) - 1)]
-            qa, qb = x[a][i], x[b][i]
+        near = self.nearness.between((who[0], who[1]), states, samples, arrangement, 0.0)
+        lo, t = samples.lo, samples.t
+        exact = (t == 0) | (t == 1) | tight[lo] | tight[np.minimum(lo + 1, len(tight) - 1)]
+        bare = exact[near.sample] | (self.tolerance > 0)
+        return self._refused(near, -near.distance - np.where(bare, near.padding, 0.0), len(samples))
 
-            def ask(k: np.ndarray) -> int:
-                return collision.first_hit(a, qa[k], held_a, b, qb[k], held_b, exact=exact[k])  # noqa: B023
+    def _refused(self, near: Near, depth: np.ndarray, n: int) -> np.ndarray:
+        """Samples of n at which all penetrations together are more than is tolerated."""
+        total = np.bincount(near.sample, weights=np.maximum(depth, 0.0), minlength=n)
+        return np.flatnonzero(total > self.tolerance)
 
-            hits += i[_all_hits(ask, np.arange(len(i)))].tolist()
-        return np.array(sorted(hits), dtype=int)
+
+def _still(x: np.ndarray, samples: Samples) -> np.ndarray:
+    """Samples (S,) at which configurations x (S, n) are those of the sample before, in the same segment."""
+    out = np.zeros(len(x), dtype=bool)
+    out[1:] = np.all(x[1:] == x[:-1], axis=1) & (np.diff(samples.segment) == 0)
+    return out
 
 
 def _doubtful(line: Polyline, samples: Samples, clearance: np.ndarray, moved: np.ndarray) -> np.ndarray:
@@ -172,18 +196,6 @@ def _doubtful(line: Polyline, samples: Samples, clearance: np.ndarray, moved: np
     apart = clearance[samples.lo, half] + clearance[samples.lo, half + 1]
     own = samples.segment == line.segment_of_step[samples.lo]
     return np.flatnonzero(~own | (apart <= _SWERVE * moved[samples.lo] / 2))
-
-
-def _all_hits(first_hit: Callable[[np.ndarray], int], rows: np.ndarray) -> np.ndarray:
-    """All rows for which a query that returns the first hit, or -1, finds one."""
-    out, start = [], 0
-    while start < len(rows):
-        k = first_hit(rows[start:])
-        if k < 0:
-            break
-        out.append(start + k)
-        start += k + 1
-    return np.array(out, dtype=int)
 
 
 def knot_samples(line: Polyline, pieces: np.ndarray) -> Samples:

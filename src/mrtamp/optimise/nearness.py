@@ -1,28 +1,25 @@
 """Which solids are near each other at samples of a motion, and how their distances change (DESIGN section 8).
 
-Drake finds the pairs and their witness points in the planner's small plants; the gradients of all of them are then
-computed at once.  Everything that moves, moves by screws: a distance d = n.(p_A - p_B) changes by W.(V_A - V_B) with
+Boxes, capsules and spheres of the planner's small plants are measured all at once, other shapes by Drake; so are the
+gradients.  Everything that moves, moves by screws: a distance d = n.(p_A - p_B) changes by W.(V_A - V_B) with
 the wrench W = (p x n, n) and the spatial velocities V = (omega, v at the world's origin) of the two bodies.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
 from mrtamp.collision import Collision
+from mrtamp.kinematics import Chain
 from mrtamp.modes import Attachment, Mode
 from mrtamp.optimise.choices import Arrangement
-from mrtamp.optimise.screws import cross, joint_screws, transported, upstream
-from mrtamp.scene import Scene, geometry_ids, robot_bodies
-
-CULL = 0.02
-"""Clearance (m) of bounding spheres beyond which nothing is asked about two robots, or about an object, in yes or no
-queries: padding and more."""
+from mrtamp.optimise.screws import cross, screws_of, transported, upstream
+from mrtamp.optimise.shapes import Poses, Shapes
+from mrtamp.scene import Scene, chain_of, geometry_ids, robot_bodies
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +57,17 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Near:
-    """Pairs of solids near each other: at `sample` (P,), `distance` (P,), wrench (P, 6), carriers `a`, `b` (P,)."""
+    """Pairs of solids near each other: at `sample` (P,), `distance` (P,), wrench (P, 6), carriers `a`, `b` (P,).
+
+    `padding` (P,) is what the two shapes are larger in the plant than they are.
+    """
 
     sample: np.ndarray
     distance: np.ndarray
     wrench: np.ndarray
     a: np.ndarray
     b: np.ndarray
+    padding: np.ndarray
 
 
 class Carriers:
@@ -114,12 +115,11 @@ class Carriers:
         return out
 
 
-def _ask(
-    plant: MultibodyPlant, context: Context, rows: np.ndarray, carrier: dict, reach: float, kept: np.ndarray
-) -> Near:
-    """Drake's nearest pairs at every row of positions; `kept` (N,) are the numbers of the samples."""
+def _ask(scene: Scene, context: Context, known: _Plant, rows: np.ndarray, reach: float, kept: np.ndarray) -> Near:
+    """Drake's nearest pairs with shapes that only it knows, at every row of the samples numbered `kept` (N,)."""
+    plant, foreign, carrier, grown = scene.plant, known.shapes.foreign, known.carrier, scene.grown
     port = plant.get_geometry_query_input_port()
-    sample, distance, normal, point, a, b = [], [], [], [], [], []
+    sample, distance, normal, point, a, b, padding = [], [], [], [], [], [], []
     last, found = None, []
     for i, row in zip(kept.tolist(), rows, strict=True):
         if last is None or not np.array_equal(row, last):
@@ -132,35 +132,74 @@ def _ask(
                     query.GetPoseInWorld(p.id_A).multiply(p.p_ACa),
                     carrier[p.id_A],
                     carrier[p.id_B],
+                    grown.get(p.id_A, 0.0) + grown.get(p.id_B, 0.0),
                 )
                 for p in query.ComputeSignedDistancePairwiseClosestPoints(reach)
+                if p.id_A in foreign or p.id_B in foreign
             ]
             last = row
-        for d, n, p, x, y in found:
+        for d, n, p, x, y, extra in found:
             sample.append(i)
             distance.append(d)
             normal.append(n)
             point.append(p)
             a.append(x)
             b.append(y)
+            padding.append(extra)
     n, p = np.array(normal).reshape(-1, 3), np.array(point).reshape(-1, 3)
     wrench = np.concatenate([cross(p, n), n], axis=1)
-    return Near(np.array(sample, dtype=int), np.array(distance), wrench, np.array(a, dtype=int), np.array(b, dtype=int))
+    i, j, k = (np.array(x, dtype=int) for x in (sample, a, b))
+    return Near(i, np.array(distance), wrench, j, k, np.array(padding))
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """A robot at samples: configurations x (S, n), bounding spheres with its load, screws (S, n, 6) of its joints."""
+    """A robot at samples: configurations x (S, n), bounding spheres with its load, screws (S, n, 6) of its joints, and
+    poses of its bodies (S, B) and of its load (S,), not a number where there is none."""
 
     x: np.ndarray
     centres: np.ndarray
     radii: np.ndarray
     screws: np.ndarray
+    R: np.ndarray
+    p: np.ndarray
+    R_load: np.ndarray
+    p_load: np.ndarray
 
     def joined(self, other: State) -> State:
         """At these samples and others."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return State(*(np.concatenate(pair) for pair in pairs))
+
+    def of(self, index: np.ndarray) -> State:
+        """At some of the samples."""
+        return State(*(x[index] for x in vars(self).values()))
+
+
+def _nowhere(n: int) -> Poses:
+    return np.zeros((n, 3, 3)), np.full((n, 3), np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class _Plant:
+    """One of the planner's plants: its shapes, and what carries each of its geometries, by id and by index (G,);
+    by how much (m) each is padded."""
+
+    shapes: Shapes
+    carrier: dict
+    number: np.ndarray
+    grown: np.ndarray
+
+    def near(
+        self, n: int, robots: Mapping[str, State], free: Mapping[str, Poses], reach: float
+    ) -> tuple[Near, np.ndarray]:
+        """What is near at n samples, and samples at which Drake has to be asked as well."""
+        poses = self.shapes.placed(n, {r: (x.R, x.p) for r, x in robots.items()}, free)
+        found = self.shapes.near(poses, reach)
+        wrench = np.concatenate([cross(found.witness, found.normal), found.normal], axis=1)
+        padding = self.grown[found.a] + self.grown[found.b]
+        near = Near(found.sample, found.distance, wrench, self.number[found.a], self.number[found.b], padding)
+        return near, self.shapes.unsettled(poses, reach)
 
 
 class Nearness:
@@ -170,34 +209,55 @@ class Nearness:
         self.collision = collision
         self.worlds = collision.worlds
         self.carriers = Carriers(collision)
-        self._ids: dict[int, dict] = {}
+        self._plants: dict[int, _Plant] = {}
+        self._chains: dict[tuple[str, float], Chain] = {}
 
-    def _carrier(self, scene: Scene) -> dict:
-        if id(scene) not in self._ids:
-            self._ids[id(scene)] = self.carriers.of_geometries(scene)
-        return self._ids[id(scene)]
+    def _plant(self, scene: Scene) -> _Plant:
+        if id(scene) not in self._plants:
+            carrier = self.carriers.of_geometries(scene)
+            shapes = Shapes(scene, {r: self.worlds[r].chain.bodies for r in scene.robots})
+            number = np.array([carrier[g] for g in shapes.ids], dtype=int)
+            grown = np.array([scene.grown.get(g, 0.0) for g in shapes.ids])
+            self._plants[id(scene)] = _Plant(shapes, carrier, number, grown)
+        return self._plants[id(scene)]
 
-    def spheres(self, robot: str, q: np.ndarray, modes: Sequence[Mode], segment: np.ndarray) -> tuple:
-        """Bounding spheres of a robot and what it holds: centres (S, B + 1, 3) and radii (S, B + 1)."""
+    def _chain(self, robot: str, held: Attachment | None) -> Chain:
+        """Kinematics of a robot with its hand as far open as what it holds has it."""
         world = self.worlds[robot]
-        centres = world.bounds.spheres(q)
-        load = np.zeros((len(q), 1, 3))
-        size = np.full((len(q), 1), -1e3)
-        for s in np.unique(segment).tolist():
-            held = modes[s].held.get(robot)
-            if held is not None:
-                rows = np.flatnonzero(segment == s)
-                R, p = world.tool.pose(q[rows])
-                load[rows, 0] = p + R @ held.X_PO[:3, 3]
-                size[rows, 0] = world.object_radius[held.object]
-        radii = np.tile(world.bounds.radii, (len(q), 1))
-        return np.concatenate([centres, load], axis=1), np.concatenate([radii, size], axis=1)
+        if held is None or held.width is None:
+            return world.chain
+        key = robot, held.width
+        if key not in self._chains:
+            self._chains[key] = chain_of(world.scene, robot, held.width)[0]
+        return self._chains[key]
 
     def state(self, robot: str, q: np.ndarray, samples: Samples, modes: Sequence[Mode]) -> State:
         """A robot with knots q (K, n) at samples of a motion through `modes`."""
+        world = self.worlds[robot]
         x = samples.at(q)
-        centres, radii = self.spheres(robot, x, modes, samples.segment)
-        return State(x, centres, radii, joint_screws(self.worlds[robot].chain, x))
+        S, B = len(x), len(world.chain.bodies)
+        R, p = np.empty((S, B, 3, 3)), np.empty((S, B, 3))
+        R_load, p_load = np.full((S, 3, 3), np.nan), np.full((S, 3), np.nan)
+        screws = np.empty((S, world.chain.n, 6))
+        size = np.full((S, 1), -1e3)
+        of = {s: modes[s].held.get(robot) for s in np.unique(samples.segment).tolist()}
+        for held in dict.fromkeys(of.values()):
+            i = np.flatnonzero(np.isin(samples.segment, [s for s, h in of.items() if h == held]))
+            chain = self._chain(robot, held)
+            Rs, ps, axes = chain.sweep(x[i])
+            for k in range(B):
+                R[i, k], p[i, k] = Rs[k], ps[k]
+            screws[i] = screws_of(chain, len(i), axes)
+            if held is not None:
+                R_WG, p_WG = world.tool.carried(Rs, ps)
+                R_load[i], p_load[i] = R_WG @ held.X_PO[:3, :3], p_WG + R_WG @ held.X_PO[:3, 3]
+                size[i] = world.object_radius[held.object]
+        bounds = world.bounds
+        bodies = [world.chain.index[b] for b in bounds.bodies]
+        centres = p[:, bodies] + (R[:, bodies] @ bounds.centres[..., None])[..., 0]
+        load = np.where(np.isnan(p_load), 0.0, p_load)[:, None]
+        radii = np.concatenate([np.tile(bounds.radii, (S, 1)), size], axis=1)
+        return State(x, np.concatenate([centres, load], axis=1), radii, screws, R, p, R_load, p_load)
 
     def rows(
         self,
@@ -224,14 +284,32 @@ class Nearness:
     def world(self, robot: str, state: State, samples: Samples, arrangement: Arrangement, reach: float) -> Near:
         """What is within `reach` (m) of a robot and its load: itself, the static world, objects at rest."""
         world = self.worlds[robot]
-        parts = []
+        known = self._plant(world.scene)
+        free: dict[str, Poses] = {}
         for s in np.unique(samples.segment).tolist():
             i = np.flatnonzero(samples.segment == s)
             mode = arrangement.modes[s]
+            for name, X in arrangement.resting(mode).items():
+                R, p = free.setdefault(name, _nowhere(len(samples)))
+                R[i], p[i] = X[:3, :3], X[:3, 3]
+            self._carry(free, world.slot_of, mode.held.get(robot), state, i)
+        near, open_ones = known.near(len(samples), {robot: state}, free, reach)
+        parts = [near]
+        for s in np.unique(samples.segment[open_ones]).tolist():
+            i = open_ones[samples.segment[open_ones] == s]
+            mode = arrangement.modes[s]
             spheres = (state.centres[i], state.radii[i])
             rows = self.rows(robot, state.x[i], mode.held.get(robot), arrangement.resting(mode), spheres, reach)
-            parts.append(_ask(world.scene.plant, world.context, rows, self._carrier(world.scene), reach, i))
+            parts.append(_ask(world.scene, world.context, known, rows, reach, i))
         return _joined(parts)
+
+    def _carry(
+        self, free: dict[str, Poses], slot_of: Mapping[str, str], held: Attachment | None, state: State, i: np.ndarray
+    ) -> None:
+        """The pose of what a robot holds at samples i."""
+        if held is not None:
+            R, p = free.setdefault(slot_of[held.object], _nowhere(len(state.x)))
+            R[i], p[i] = state.R_load[i], state.p_load[i]
 
     def close(self, spheres: tuple[tuple, tuple], far: float) -> np.ndarray:
         """Samples at which bounding spheres of two robots come within `far` (m)."""
@@ -261,13 +339,32 @@ class Nearness:
         """What is within `reach` (m) between two robots and their loads."""
         a, b = states
         close = self.close(((a.centres, a.radii), (b.centres, b.radii)), reach)
-        pair, _ = self.collision.pair(*robots)
-        parts = []
-        for s in np.unique(samples.segment[close]).tolist():
-            i = close[samples.segment[close] == s]
+        pair, swapped = self.collision.pair(*robots)
+        known = self._plant(pair.scene)
+        within = samples[close]
+        at = {r: x.of(close) for r, x in zip(robots, states, strict=True)}
+        free: dict[str, Poses] = {}
+        for s in np.unique(within.segment).tolist():
+            i = np.flatnonzero(within.segment == s)
+            for robot, slot_of in zip(robots, pair.slot_of[::-1] if swapped else pair.slot_of, strict=True):
+                self._carry(free, slot_of, arrangement.modes[s].held.get(robot), at[robot], i)
+        near, open_ones = known.near(len(close), at, free, reach)
+        parts = [replace(near, sample=close[near.sample])]
+        for s in np.unique(within.segment[open_ones]).tolist():
+            i = close[open_ones[within.segment[open_ones] == s]]
             rows = self.pair_rows(*robots, a.x[i], b.x[i], arrangement.modes[s])
-            parts.append(_ask(pair.scene.plant, pair.context, rows, self._carrier(pair.scene), reach, i))
+            parts.append(_ask(pair.scene, pair.context, known, rows, reach, i))
         return _joined(parts)
+
+    def touching(self, robot: str, contact: np.ndarray, near: Near) -> np.ndarray:
+        """Pairs (P,) of a robot's load and what it may touch: at every sample a name in `contact` (S,), or ''."""
+        number = self.carriers.number
+        numbers = {"": -2}
+        for name in set(contact) - {""}:
+            numbers[name] = number.get(("static", name), number.get(("object", name), -2))
+        support = np.array([numbers[c] for c in contact], dtype=int)[near.sample]
+        held = number["held", robot]
+        return ((near.a == held) & (near.b == support)) | ((near.b == held) & (near.a == support))
 
     def joint_gradient(self, robot: str, state: State, near: Near) -> np.ndarray:
         """Change of the distances (P, n) with the configurations of a robot."""
@@ -310,7 +407,7 @@ class Nearness:
 
 
 def _joined(parts: Sequence[Near]) -> Near:
-    if not parts:
-        return Near(np.zeros(0, int), np.zeros(0), np.zeros((0, 6)), np.zeros(0, int), np.zeros(0, int))
-    names = ("sample", "distance", "wrench", "a", "b")
-    return Near(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
+    sample, distance, wrench, a, b, padding = (
+        np.concatenate(x) for x in zip(*(vars(p).values() for p in parts), strict=True)
+    )
+    return Near(sample, distance, wrench, a, b, padding)

@@ -33,7 +33,7 @@ TRUST = 0.35
 _SLIDING = 0.2
 """The same (m) where all joints slide: a step of that size takes a whole robot along."""
 _LARGEST, _SMALLEST = 0.5, 0.01
-_DEEP = 0.03
+_DEEP = 0.06
 """Penetration (m) at which a step is rejected."""
 _SHALLOW = 1e-3
 """Penetration (m) at the program's own samples that makes a finer look pointless."""
@@ -117,8 +117,8 @@ class Optimiser:
         line = load(segments, transitions, {r: w.tool for r, w in self.worlds.items()})
         self._best = self._sure = self._iterate(line, line.q, self.choices.at(self.choices.start))
         self._now = self._best
-        self._resample()
         self._rows: CollisionRows | None = None
+        self._resample()
 
     # -- the result -------------------------------------------------------------------------------------------------
 
@@ -179,7 +179,7 @@ class Optimiser:
         self._sure = self._iterate(self._sure.line, self._sure.q, self.choices.at(self.choices.start))
         self._best = self._now = self._sure
         self._rows = None
-        self._adopt(self._now.line)
+        self._adopt(self._now)
 
     def _return_to(self, iterate: Iterate) -> None:
         """Go on from an earlier iterate."""
@@ -187,7 +187,7 @@ class Optimiser:
             # What violations taught is about steps of the other polyline.
             self.collisions.forget()
         self._now, self._rows = iterate, None
-        self._adopt(iterate.line)
+        self._adopt(iterate)
 
     # -- one step ---------------------------------------------------------------------------------------------------
 
@@ -200,30 +200,35 @@ class Optimiser:
         if self._rows is None:
             self._rows = self.collisions.rows(now.line, now.q, now.arrangement)
         self.steps += 1
-        candidate = self._solve(now, self._rows)
-        if candidate is None:
+        solved = self._solve(now, self._rows)
+        if solved is None:
             return self._reject()
+        demands = self.collisions.demands
+        candidate = self._resampled(solved) if self._stretched(solved) else solved
         where = (candidate.line, candidate.q, candidate.arrangement)
         rows = self.collisions.rows(*where)
-        if rows.deepest > max(_DEEP, self._rows.deepest):
+        deepest = rows.deepest(self.problem.collision.tolerance)
+        if deepest > max(_DEEP, self._rows.deepest(self.problem.collision.tolerance)):
+            self.collisions.demands = demands
             return self._reject()
-        clean = rows.deepest < _SHALLOW
+        before = self._merit(now, self._rows)
+        self._now = candidate
+        if candidate.line is not now.line:
+            self._adopt(candidate)
+        clean = deepest < _SHALLOW
         if clean:
             violations = self._violations(candidate, rows)
             clean = not violations
             if violations:
                 rows = rows.joined(self.collisions.more(*where, self.collisions.learn(violations)))
-        before = self._merit(now, self._rows)
         after = self._merit(candidate, rows)
-        self._now, self._rows, self._worth = candidate, rows, after
+        self._rows, self._worth = rows, after
         gain = 0.0
         if clean and candidate.cost < self._best.cost - _EPS:
             gain = self._best.cost - candidate.cost
             self._best = candidate
         self._clear_up(clean)
         self._pace(before, after, self._promise + self._changes, clean)
-        if self._now is candidate and candidate.line.lengths(candidate.q).max() > 1.4 * self.knot:
-            self._resample()
         return gain
 
     def _pace(self, before: float, after: float, promised: float, clean: bool) -> None:
@@ -243,8 +248,13 @@ class Optimiser:
         self._grazing = 0 if clean else self._grazing + 1
         promising = self._now.cost < (1 - _WORTH_CLEARING) * self._best.cost
         pad = _PADS[min(self._grazing // _GRAZES, len(_PADS) - 1)] if promising else 0.0
-        if pad != self.collisions.pad:
-            self.collisions.pad, self._rows = pad, None
+        self._ask_for(pad)
+
+    def _ask_for(self, pad: float) -> None:
+        """Clearance (m) that is asked for everywhere on top."""
+        if self._rows is not None:
+            self._rows = self._rows.stricter(pad - self.collisions.pad)
+        self.collisions.pad = pad
 
     def _settle(self, done: bool) -> None:
         """Where the polyline has converged, go on with finer steps beside its bends."""
@@ -264,8 +274,7 @@ class Optimiser:
             # What has converged still grazes something: it must come free to count.
             self._last_chances -= 1
             self._stalls, self.trust = 0, max(self.trust, 4 * _SMALLEST)
-            if self.collisions.pad < _PADS[-1]:
-                self.collisions.pad, self._rows = _PADS[-1], None
+            self._ask_for(_PADS[-1])
         else:
             self.converged = done
 
@@ -293,7 +302,7 @@ class Optimiser:
         equal = self._stacked(self._closure.equalities(now.q, now.arrangement), n + count)[0]
         F, g = self._stacked(self._closure.inequalities(now.q, now.arrangement), n + count)
         linear = Linearised(sparse.csr_array(rows.A @ whole), -rows.gap, equal, F, g, lower, upper)
-        solved = solve(self._reduction, now.q, self.weights, linear)
+        solved = solve(self._reduction, now.q, self.weights, linear, self.collisions.level)
         if solved is None:
             return None
         x, self._promise = solved
@@ -357,19 +366,25 @@ class Optimiser:
         chains = [self.worlds[r].chain for r in self._now.line.columns]
         return np.concatenate([c.lower for c in chains]), np.concatenate([c.upper for c in chains])
 
-    def _resample(self) -> None:
-        """Spread the knots of the current iterate evenly again."""
-        now = self._now
-        line = Polyline(now.line.columns, now.q, now.line.events, now.line.stretches)
+    def _stretched(self, x: Iterate) -> bool:
+        """Whether steps have become too long."""
+        return bool(x.line.lengths(x.q).max(initial=0.0) > 1.4 * self.knot)
+
+    def _resampled(self, x: Iterate) -> Iterate:
+        """An iterate with its knots spread evenly again; demands move along."""
+        line = Polyline(x.line.columns, x.q, x.line.events, x.line.stretches)
         u = line.resampled(self.knot, self.collisions.level)
         fresh = line.at(u)
         self.collisions.move(u)
-        self._now = self._iterate(fresh, fresh.q, now.arrangement)
-        self._rows = None
-        self._adopt(fresh)
+        return self._iterate(fresh, fresh.q, x.arrangement)
 
-    def _adopt(self, line: Polyline) -> None:
+    def _resample(self) -> None:
+        """Spread the knots of the current iterate evenly again."""
+        self._now, self._rows = self._resampled(self._now), None
+        self._adopt(self._now)
+
+    def _adopt(self, x: Iterate) -> None:
         """Variables and closure rows for a new set of knots."""
-        self._pinned = pins(self.problem, line, self._now.arrangement.transitions, self.slide)
-        self._reduction: Reduction = reduce(line, self._pinned)
-        self._closure = Closure(self.problem, self.worlds, line, self._now.q, self._pinned)
+        self._pinned = pins(self.problem, x.line, x.arrangement.transitions, self.slide)
+        self._reduction: Reduction = reduce(x.line, self._pinned)
+        self._closure = Closure(self.problem, self.worlds, x.line, x.q, self._pinned)

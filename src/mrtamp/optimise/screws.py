@@ -5,6 +5,8 @@ In that form velocities of bodies, of objects on bodies and of witness points ne
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from mrtamp.kinematics import Chain
@@ -26,8 +28,13 @@ def transported(screws: np.ndarray, X: np.ndarray) -> np.ndarray:
 
 def joint_screws(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Screws (N, n, 6) of all joints in W at q (N, n)."""
-    out = np.zeros((len(q), chain.n, 6))
-    for column, axis, origin in chain._sweep(q)[2]:
+    return screws_of(chain, len(q), chain.sweep(q)[2])
+
+
+def screws_of(chain: Chain, n: int, axes: Iterable[tuple[int, np.ndarray, np.ndarray]]) -> np.ndarray:
+    """The same (n, joints, 6) from the axes of a sweep of the chain."""
+    out = np.zeros((n, chain.n, 6))
+    for column, axis, origin in axes:
         if chain.prismatic[column]:
             out[:, column, 3:] = axis
         else:
@@ -39,9 +46,9 @@ def joint_screws(chain: Chain, q: np.ndarray) -> np.ndarray:
 def upstream(chain: Chain) -> dict[str, np.ndarray]:
     """Body -> which joints (n,) move it, 0 or 1."""
     masks: list[np.ndarray] = []
-    for link in chain._links:
+    for link in chain.links:
         mask = np.zeros(chain.n) if link.parent < 0 else masks[link.parent].copy()
         if link.column >= 0:
             mask[link.column] = 1.0
         masks.append(mask)
-    return {body: masks[chain._index[body]] for body in chain.bodies}
+    return {body: masks[chain.index[body]] for body in chain.bodies}
