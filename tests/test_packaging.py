@@ -33,7 +33,13 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_wheel_holds_the_package_the_models_and_nothing_else(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
-    wanted = ("player.html", "py.typed", "models/robots/panda.urdf", "models/problems/handover.yaml")
+    wanted = (
+        "player.html",
+        "py.typed",
+        "models/robots/panda.urdf",
+        "models/problems/handover.yaml",
+        "models/suites/smoke.yaml",
+    )
     for name in (*(f"mrtamp/{w}" for w in wanted), "mrtamp/models/schema/problem.schema.json"):
         assert name in names
     assert any(name.endswith("/LICENSE") for name in names)

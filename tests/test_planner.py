@@ -185,7 +185,7 @@ def fingerprint(planner: Planner) -> str:
             digest.update(b"".join(q.tobytes() for q in segment.q.values()))
             digest.update(b"".join(a.X_PO.tobytes() for a in segment.mode.attachments))
         digest.update(repr([entry["cost"] for entry in planner.best.history]).encode())
-    digest.update(repr(planner.counts.as_dict()).encode())
+    digest.update(repr(planner.counts()).encode())
     return digest.hexdigest()
 
 

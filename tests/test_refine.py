@@ -63,7 +63,7 @@ def test_a_fresh_refiner_has_the_motion_and_the_cost_of_its_plan(planner: Planne
 
 def test_refined_plans_are_cheaper_and_pass_the_check(planner: Planner, plan: Plan, refined: Refiner) -> None:
     assert refined.cost < 0.9 * plan.cost
-    better = Incumbent(planner.problem, 0, planner.counts).plan(refined.segments(), refined.transitions)
+    better = Incumbent(planner.problem, 0, planner.collision.counts).plan(refined.segments(), refined.transitions)
     assert better.cost == pytest.approx(refined.cost, rel=1e-9)
     assert mrtamp.check_plan(better).ok
 

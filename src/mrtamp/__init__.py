@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mrtamp.check import check_plan
     from mrtamp.plan import Plan
     from mrtamp.planner import Options, Planner, Status
+    from mrtamp.planners import PLANNERS, make_planner
     from mrtamp.problem import MrtampError, Problem, ProblemError
     from mrtamp.problem_file import list_problems, load_problem
     from mrtamp.view import inline, view, write_html
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _HOMES = {
+    "PLANNERS": "planners",
     "MrtampError": "problem",
     "Options": "planner",
     "Plan": "plan",
@@ -38,11 +40,13 @@ _HOMES = {
     "inline": "view",
     "list_problems": "problem_file",
     "load_problem": "problem_file",
+    "make_planner": "planners",
     "view": "view",
     "write_html": "view",
 }
 
 __all__ = [
+    "PLANNERS",
     "MrtampError",
     "Options",
     "Plan",
@@ -55,6 +59,7 @@ __all__ = [
     "inline",
     "list_problems",
     "load_problem",
+    "make_planner",
     "view",
     "write_html",
 ]

@@ -19,12 +19,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from mrtamp.bench_cli import add_suites
-from mrtamp.mechanisms import INTRA_ORBIT_NAMES, MECHANISMS
+from mrtamp.bench.arguments import add_bench, parse
+from mrtamp.mechanisms import BASELINE_MECHANISMS, INTRA_ORBIT_NAMES, MECHANISMS, PLANNER_NAMES
 
 if TYPE_CHECKING:
     from mrtamp.plan import Plan
-    from mrtamp.planner import Planner
+    from mrtamp.planners import AnyPlanner
+    from mrtamp.portfolio_plan import SeedPortfolio
     from mrtamp.problem import Problem
 
 FOUND, NOT_FOUND, BAD_INPUT = 0, 1, 2
@@ -90,19 +91,18 @@ def _list(options: argparse.Namespace) -> int:
 def _plan(options: argparse.Namespace) -> int:
     from mrtamp.progress import ProgressLine
 
+    if options.scheduler is not None and options.portfolio is None:
+        raise _BadInput("found --scheduler without --portfolio N, expected both: one seed is planned here")
     if options.out and options.html and options.out.resolve() == options.html.resolve():
         raise _BadInput(f"--out and --html are the same file, {options.out}")
     for path in (options.out, options.html):
         _ensure_writable(path)
     started = time.monotonic()
-    planner: Planner | None = None
+    planner: AnyPlanner | SeedPortfolio | None = None
     with _stop_on_signals() as signals, ProgressLine(sys.stderr, enabled=not options.quiet) as progress:
         try:
             problem = _load_problem(options)
-            from mrtamp.planner import Options, Planner
-
-            settings = Options(without=frozenset(options.without), intra_orbit=options.intra_orbit)
-            planner = Planner(problem, seed=options.seed, options=settings)
+            planner = _planner(options, problem)
             budget = options.budget
             if budget is None and options.iterations is None:
                 budget = DEFAULT_BUDGET_S
@@ -124,13 +124,30 @@ def _plan(options: argparse.Namespace) -> int:
         write_html(best, options.html)
         written.append(options.html)
     assert planner is not None
-    _report_plan(options, best, elapsed, written, planner.skeletons.bound, stopped=bool(signals))
+    _report_plan(options, best, elapsed, written, planner.sampled_bound, stopped=bool(signals))
     if options.view:
         _serve(best, options)
     return FOUND
 
 
-def _report_failure(options: argparse.Namespace, planner: Planner | None, elapsed: float, *, stopped: bool) -> int:
+def _planner(options: argparse.Namespace, problem: Problem) -> AnyPlanner | SeedPortfolio:
+    from mrtamp.planners import make_planner, planner_options
+
+    given = {"without": options.without} if options.without else {}
+    if options.intra_orbit is not None:
+        given["intra_orbit"] = options.intra_orbit
+    settings = planner_options(options.planner, given)
+    if options.portfolio is None:
+        return make_planner(options.planner, problem, options.seed, settings)
+    from mrtamp.portfolio_plan import SeedPortfolio
+
+    seeds = range(options.seed, options.seed + options.portfolio)
+    return SeedPortfolio(problem, seeds, scheduler=options.scheduler, planner=options.planner, options=settings)
+
+
+def _report_failure(
+    options: argparse.Namespace, planner: AnyPlanner | SeedPortfolio | None, elapsed: float, *, stopped: bool
+) -> int:
     explanation = planner.explain() if planner else "stopped before planning began"
     reason = f"{'stopped' if stopped else 'no plan'} after {elapsed:.1f} s without a plan"
     if not stopped:
@@ -171,8 +188,9 @@ def _report_plan(
     if options.quiet:
         return
     manner = "stopped; the best plan so far, checked" if stopped else "plan found and checked"
+    others = f", best of {plan.found_by['portfolio']}" if "portfolio" in plan.found_by else ""
     blocks = [
-        f"{plan.problem.name}: {manner} (seed {plan.seed}, {elapsed:.1f} s)",
+        f"{plan.problem.name}: {manner} (seed {plan.seed}{others}, {elapsed:.1f} s)",
         report.timeline_text(plan),
         report.cost_text(plan),
         _bound_text(plan.cost, bound),
@@ -256,19 +274,20 @@ def _serve(what: Plan | Problem, options: argparse.Namespace) -> None:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    """One suite of measurements; `options.suite` plans and prints it."""
-    from mrtamp.bench_table import Line
+    """One kind of measurement; `chosen.measure` takes it and prints it."""
+    chosen = parse(options.what, options.arguments, _positive)
+    from mrtamp.bench.table import Line
 
-    files = [options.raw, options.plot]
-    if options.update:
-        from mrtamp.bench_best import best_known_file
+    files = chosen.files
+    if chosen.update:
+        from mrtamp.bench.best import best_known_file
 
         files.append(best_known_file())
     for path in files:
         _ensure_writable(path)
     with _stop_on_signals(), Line(sys.stderr, lambda text: print(text, flush=True)) as line:
         try:
-            good = options.suite(options, line)
+            good = chosen.measure(chosen, line)
         except KeyboardInterrupt:
             line.say("stopped: the rows above are what was finished")
             return NOT_FOUND
@@ -380,9 +399,11 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument(
             "problem", metavar="PROBLEM|FILE", help="a shipped problem (see mrtamp list) or a YAML file"
         )
-        command.add_argument("--robots", type=count, metavar="N", help="number of robots (pick_place)")
-        command.add_argument("--objects", type=count, metavar="N", help="number of objects (pick_place)")
-        command.add_argument("--layout-seed", type=_natural, metavar="N", help="seed of the layout (pick_place)")
+        command.add_argument("--robots", type=count, metavar="N", help="number of robots (generated problems)")
+        command.add_argument("--objects", type=count, metavar="N", help="number of objects (generated problems)")
+        command.add_argument(
+            "--layout-seed", type=_natural, metavar="N", help="seed of the layout (generated problems)"
+        )
 
     listing = commands.add_parser("list", help="list the shipped problems")
     listing.add_argument("--json", action="store_true", help="print one JSON object")
@@ -390,7 +411,22 @@ def _parser() -> argparse.ArgumentParser:
 
     plan = commands.add_parser("plan", help="plan a problem and keep improving the plan")
     problem_arguments(plan)
+    plan.add_argument(
+        "--planner",
+        default=PLANNER_NAMES[0],
+        choices=PLANNER_NAMES,
+        help=f"which planner (default {PLANNER_NAMES[0]}); the others are baselines to compare with",
+    )
     plan.add_argument("--seed", type=_natural, default=0, metavar="N", help="seed of the planner (default 0)")
+    plan.add_argument(
+        "--portfolio",
+        type=count,
+        metavar="N",
+        help="plan with N seeds side by side, from --seed on; the best wins",
+    )
+    plan.add_argument(
+        "--scheduler", metavar="ADDRESS", help="where: a Dask scheduler, tcp://host:port (default: N processes here)"
+    )
     seconds = _positive(float, "a positive number of seconds")
     plan.add_argument("--budget", type=seconds, metavar="S", help=f"seconds of planning (default {DEFAULT_BUDGET_S:g})")
     plan.add_argument("--iterations", type=count, metavar="N", help="stop after N iterations; repeatable for a seed")
@@ -403,12 +439,11 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="MECHANISM",
-        choices=sorted(MECHANISMS),
-        help=f"switch a mechanism off (repeatable): {', '.join(MECHANISMS)}",
+        choices=sorted({**MECHANISMS, **BASELINE_MECHANISMS}),
+        help=f"switch a mechanism off (repeatable): {', '.join({**MECHANISMS, **BASELINE_MECHANISMS})}",
     )
     plan.add_argument(
         "--intra-orbit",
-        default="tensor-tree",
         choices=INTRA_ORBIT_NAMES,
         help="planner of motion inside an orbit (default tensor-tree)",
     )
@@ -432,9 +467,9 @@ def _parser() -> argparse.ArgumentParser:
     show.add_argument("--html", type=Path, metavar="FILE", help="write a page instead of opening a window")
     show.set_defaults(run=_show)
 
-    bench = commands.add_parser("bench", help="measure: first plans, costs, convergence, memory, mechanisms; as tables")
+    bench = commands.add_parser("bench", help="measure planners: suites of runs, their reports and comparisons")
     bench.set_defaults(run=_bench)
-    add_suites(bench, _positive)
+    add_bench(bench)
     return parser
 
 

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 from mrtamp.transitions.candidate import Outcome, StratumKey
 
 if TYPE_CHECKING:
+    from mrtamp.baselines.anytime import Anytime
     from mrtamp.planner import Planner
 
 _MANY = 12
 
 
-def explain(planner: Planner) -> str:
+def explain(planner: Planner | Anytime) -> str:
     """A few lines for a person: the nearest mode, the strata that never gave a transition, the motions that failed."""
     lines = []
     modes = list(planner.modes())
@@ -36,7 +37,7 @@ def explain(planner: Planner) -> str:
         lines.append(
             f"The check refused {planner.incumbent.refused} plans, the last for {planner.incumbent.last_refusal}"
         )
-    trouble = [(count, robot, other) for (robot, other), count in planner.growth.motion.trouble.items()]
+    trouble = [(count, robot, other) for (robot, other), count in planner.trouble.items()]
     if trouble:
         lines.append("Motions that failed, and what was in the way:")
         for count, robot, other in sorted(trouble, reverse=True)[:_MANY]:
@@ -44,7 +45,7 @@ def explain(planner: Planner) -> str:
     return "\n".join(lines)
 
 
-def _object_lines(planner: Planner, item: str) -> list[str]:
+def _object_lines(planner: Planner | Anytime, item: str) -> list[str]:
     tried = [(key, o) for key, o in planner.sampler.outcomes.items() if key[2] == item and o.calls]
     failed = [(key, o) for key, o in tried if not o.accepted]
     goals = set(planner.guidance.goal_places(item))

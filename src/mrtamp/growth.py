@@ -130,10 +130,20 @@ class Growth:
             node = after
         return self.towards_goal(node) if self.is_goal_mode(node.mode) else None
 
-    def insert(self, proposal: Proposal, skeletons: SkeletonGuidance, root: Node) -> Timed | None:
+    def insert(
+        self,
+        proposal: Proposal,
+        skeletons: SkeletonGuidance,
+        root: Node,
+        *,
+        varied: bool = False,
+        alone: bool = False,
+    ) -> Timed | None:
         """Realise a skeleton in space and time, motions of all robots inserted among each other; None if that fails.
 
-        The stop at which it ends is reported to the guidance.
+        The stop at which it ends is reported to the guidance.  With `varied`, and where its order was realised before,
+        order and ways are in part left to chance; that such an attempt fails is not held against the skeleton.
+        `alone`: robots may collide with each other, for convex programs to pull apart.
         """
         stops = [stop for stop, _ in proposal.stops]
         start = dict(zip(self.names, root.at, strict=True))
@@ -144,11 +154,13 @@ class Growth:
             proposal.before,
             lambda k, mode: skeletons.candidate(stops[k], mode),
             self.goal_vertices,
-            _VARIETY if proposal.repeated else 0.0,
+            _VARIETY if varied or proposal.repeated else 0.0,
+            alone=alone,
         )
         if timed is None:
             assert self.insertion.stuck is not None
-            skeletons.failed(proposal.stops[self.insertion.stuck][1])
+            if not varied and not alone:
+                skeletons.failed(proposal.stops[self.insertion.stuck][1])
             return None
         return timed if self.is_goal_mode(timed[0][-1].mode) else None
 

@@ -94,6 +94,8 @@ class Insertion:
         stand: Stand,
         goal: Mapping[str, int],
         variety: float = 0.0,
+        *,
+        alone: bool = False,
     ) -> tuple[list[Segment], list[Transition]] | None:
         """Motions that bring about the stops and end at the goal vertices, or None.
 
@@ -105,12 +107,14 @@ class Insertion:
         stand : transitions at the stops.
         variety : how often (0 to 1) a stop that can happen next does so although another could happen sooner, and a
             leg takes another way than the shortest.
+        alone : robots keep clear of all but each other: a draft, as cheap as the skeleton promises where it is free.
         """
         self.stuck = None
         self._variety = variety
         self._known.clear()
         if self._clearances.size > _TABLES:
             self._forget()
+        self._clearances.alone = alone
         q = {r: self.roadmaps[r].q[v] for r, v in start.items()}
         time = SpaceTime(self._clearances, q, [root])
         state = _State(time, dict(start), root, tuple(range(len(robots))))

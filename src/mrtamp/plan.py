@@ -80,6 +80,8 @@ class Plan:
     counts: dict[str, int] = field(default_factory=dict)
     seed: int | None = None
     versions: dict[str, str] = field(default_factory=dict)
+    found_by: dict[str, str] = field(default_factory=dict)
+    """What there is to say about how it was found, beyond the seed."""
 
     def save(self, path: str | Path) -> None:
         """Write the plan to a file that stands alone; see `mrtamp.plan_file.save_plan`."""

@@ -136,6 +136,7 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
         "measures": dict(measures(plan.segments)),
         "seed": plan.seed,
         "versions": dict(plan.versions),
+        **({"found_by": dict(plan.found_by)} if plan.found_by else {}),
         "counts": {name: int(count) for name, count in plan.counts.items()},
         "history": [{key: float(value) for key, value in entry.items()} for entry in plan.history],
         "attachments": [{"id": i, **_attachment_to_dict(a)} for i, a in attachments.values()],
@@ -162,7 +163,7 @@ def plan_from_dict(data: dict[str, Any], file: str | Path | None = None) -> Plan
 def _read(document: Document) -> Plan:
     entries = document.root.mapping(
         ("mrtamp_plan", "problem", "cost", "attachments", "segments", "transitions"),
-        ("measures", "seed", "versions", "counts", "history"),
+        ("measures", "seed", "versions", "found_by", "counts", "history"),
     )
     if entries["mrtamp_plan"].data != PLAN_VERSION:
         raise entries["mrtamp_plan"].wrong(f"version {PLAN_VERSION} of the plan format")
@@ -189,6 +190,7 @@ def _read(document: Document) -> Plan:
         counts={key: _whole(value) for key, value in _free_mapping(entries.get("counts")).items()},
         seed=seed,
         versions={key: value.text() for key, value in _free_mapping(entries.get("versions")).items()},
+        found_by={key: value.text() for key, value in _free_mapping(entries.get("found_by")).items()},
     )
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,19 +16,20 @@ from mrtamp.collision import Collision, Counts
 from mrtamp.coordination import coordinate
 from mrtamp.effort import Effort
 from mrtamp.explain import explain
-from mrtamp.growth import Growth
+from mrtamp.growth import Growth, Timed
 from mrtamp.guidance import Choice, ModalGuidance
 from mrtamp.incumbent import Incumbent
 from mrtamp.intra_orbit.planners import INTRA_ORBIT
 from mrtamp.mechanisms import MECHANISMS
 from mrtamp.modes import Mode, start_mode
-from mrtamp.plan import Plan, Transition
+from mrtamp.plan import Plan, Transition, plan_cost
 from mrtamp.portfolio import Portfolio
 from mrtamp.problem import MrtampError, Problem
 from mrtamp.roadmap import Roadmap
-from mrtamp.skeleton_guidance import SkeletonGuidance
+from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
 from mrtamp.tensor_tree import Node
 from mrtamp.transitions.candidate import Candidate
+from mrtamp.transitions.choices import known_candidates, new_candidates
 from mrtamp.transitions.projection import uniform_configurations
 from mrtamp.transitions.sampler import TransitionSampler
 from mrtamp.validity import Validity
@@ -41,7 +42,7 @@ _PATIENCE = 4
 
 _SKELETON_TURN = 4
 """Before the first plan, every so many iterations skeletons have their turn."""
-_FIRST_WAYS, _MORE_WAYS = (40, 14), (64, 20)
+_FIRST_WAYS, _MORE_WAYS = (80, 14), (64, 20)
 """IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
 _REALISATIONS = 6
 """Skeletons that are tried at a time."""
@@ -58,6 +59,12 @@ _REWIRINGS = 6
 """Steps that may be validated for rewiring per insertion, once there is a plan."""
 _QUICK, _THOROUGH = 30, 300
 """Orders evaluated per search for skeletons, before there is a plan and later."""
+_RIVALS, _INSERTIONS = 2, 3
+"""Skeletons of which the cheapest is refined, and realisations of each that are compared."""
+_SKETCHED, _DRAFTS = 4, 3
+"""Skeletons that are drafted at a time, and drafts of them that are refined."""
+_POOR = 2.0
+"""A first realisation that costs so many times what its skeleton promised is not the only one."""
 _HOPE = 1.0
 """Skeletons are realised while their estimate is less than the incumbent's cost times this."""
 _TIE = 0.25
@@ -130,12 +137,14 @@ class Planner:
         self._clock = time.perf_counter()
         self._spent = 0.0
         self.rng = np.random.default_rng(seed)
-        self.counts = Counts()
-        self.collision = Collision(problem, self.counts)
+        self._counts = Counts()
+        self.collision = Collision(problem, self._counts)
         radius = max([0.1, *(r for w in self.collision.worlds.values() for r in w.object_radius.values())])
         self.roadmaps = {r.name: Roadmap(self.collision.worlds[r.name], radius) for r in problem.robots}
         self.names = list(self.roadmaps)
-        self.validity = Validity(problem, self.collision, self.roadmaps)
+        self.validity = Validity(problem, self.collision, self.roadmaps, remember=self._uses("factored-cache"))
+        for roadmap in self.roadmaps.values():
+            roadmap.inserted = None if self._uses("lazy-validation") else self.validity.insert
         self.sampler = TransitionSampler(problem, self.collision, self.roadmaps, self.validity, self.rng)
         self.growth = Growth(problem, self.roadmaps, self.validity, self.rng, self.options.intra_orbit)
         self.graphs, self.tree = self.growth.graphs, self.growth.tree
@@ -144,7 +153,8 @@ class Planner:
         self._path: list[int] = []
         self._tree_cost = np.inf
         self._stale = self._skeletons_from = 0
-        self.incumbent = Incumbent(problem, seed, self.counts)
+        self._drafting = False
+        self.incumbent = Incumbent(problem, seed, self._counts)
         self.incumbent.check_start()
         mode = start_mode(problem)
         self.sampler.remember(mode)
@@ -171,6 +181,8 @@ class Planner:
             {"refinement": self.options.refinement_share},
         )
         self._timed = True
+        self.bound: Callable[[], float] = lambda: np.inf
+        """Cost of a plan that is known elsewhere; what does not promise to beat it is not worked on."""
         self._spent = time.perf_counter() - self._clock
 
     @property
@@ -236,7 +248,7 @@ class Planner:
         skeletons = self._uses("skeletons") and self.skeletons.applies and self.iteration >= self._skeletons_from
         if self.best is None:
             return "skeletons" if skeletons and self.iteration % _SKELETON_TURN == 0 else "search"
-        refine = self._uses("refinement") and not self.portfolio.idle(self._cost())
+        refine = self._uses("refinement") and not self.portfolio.idle(self._to_beat())
         skeletons = skeletons and not (refine and self.portfolio.busy)
         available = ["search", *(["skeletons"] if skeletons else []), *(["refinement"] if refine else [])]
         return self._effort.next(available)
@@ -246,6 +258,9 @@ class Planner:
 
     def _cost(self) -> float:
         return self.best.cost if self.best is not None else np.inf
+
+    def _to_beat(self) -> float:
+        return min(self._cost(), self.bound())
 
     def _incumbent(self) -> Plan:
         assert self.best is not None
@@ -367,12 +382,19 @@ class Planner:
         for choice in choices:
             failed = self.guidance.failed(mode, choice)
             guided = len(choices) == 1 and failed < _PATIENCE
-            known = self._known(mode, choice)
+            known = known_candidates(self.sampler, mode, choice)
             if guided:
                 known = [c for c in known if c.promising and not (self.best is None and self.growth.taken(mode, c))]
             # Grow the set while it is small, later in step with its logarithm, for ever.
             if len(known) < 4 or self.best is not None or self.rng.random() < 0.3 + self.options.persistent:
-                known = [*(c for c in self._sample(mode, choice) if c.promising or not guided), *known]
+                known = [
+                    *(
+                        c
+                        for c in new_candidates(self.sampler, mode, choice, self.options.transition_samples)
+                        if c.promising or not guided
+                    ),
+                    *known,
+                ]
             if guided and not self._still_best(mode, choice):
                 # What the sampler saw ahead changed the estimate: better to act on that.
                 return []
@@ -392,26 +414,6 @@ class Planner:
     def _low_index(self, n: int) -> int:
         """An index below n, earlier ones more likely."""
         return int(min(n - 1, self.rng.geometric(0.35) - 1))
-
-    def _known(self, mode: Mode, choice: Choice) -> list[Candidate]:
-        if choice.kind == "reach":
-            return self.sampler.reaching.known(mode, self.problem.subgoal(choice.place))
-        if choice.kind == "pick":
-            return self.sampler.picks(mode, choice.robots[0], choice.object)
-        if choice.kind == "place":
-            return self.sampler.places(mode, choice.robots[0], choice.place)
-        return self.sampler.handovers(mode, *choice.robots)
-
-    def _sample(self, mode: Mode, choice: Choice) -> list[Candidate]:
-        n = self.options.transition_samples
-        if choice.kind == "reach":
-            return self.sampler.reaching.sample(mode, self.problem.subgoal(choice.place), n)
-        if choice.kind == "pick":
-            return self.sampler.sample_pick(mode, choice.robots[0], choice.object, n)
-        if choice.kind == "place":
-            return self.sampler.sample_place(mode, choice.robots[0], choice.place, n)
-        giver, receiver = choice.robots
-        return self.sampler.sample_handover(mode, giver, receiver, 3 * n // 2)
 
     def _discover_adjacent_orbit(self, orbit: int, combination: tuple[Candidate, ...]) -> None:
         """Note the modal state that a sampled transition leads to."""
@@ -463,29 +465,72 @@ class Planner:
             self._expand_roadmaps()
         self.skeletons.grow(*(_FIRST_WAYS if first else _MORE_WAYS))
         self.skeletons.update_bound()
+        if not first and self._uses("drafts") and self.portfolio.convex and self._draft():
+            return False
         tries = 0
         while tries < _REALISATIONS:
             failed: set[int] = set()
-            for proposal in self.skeletons.propose(_HOPE * self._cost(), _QUICK if first else _THOROUGH):
+            inserted: list[tuple[float, Timed, Proposal]] = []
+            for proposal in self.skeletons.propose(_HOPE * self._to_beat(), _QUICK if first else _THOROUGH):
                 if failed & {id(way) for _, way in proposal.stops}:
                     # The guidance has learnt something about these since.
                     continue
                 tries += 1
-                timed = self.growth.insert(proposal, self.skeletons, self.root)
-                plan = None if timed is None else self.incumbent.accepted(*timed)
-                if plan is not None:
-                    self.skeletons.realised(proposal)
-                    return self._adopt(plan)
+                best = self._cheapest_insertion(proposal)
+                if best is not None:
+                    inserted.append((*best, proposal))
+                    if first or len(inserted) == _RIVALS:
+                        break
+                    continue
                 node = self.growth.realise(proposal, self.skeletons, self.root)
                 if node is not None:
                     self.skeletons.realised(proposal)
                     return self._solution(node)
                 failed = {id(way) for _, way in proposal.stops if way.failures}
                 if tries >= _REALISATIONS:
-                    return False
+                    break
+            # An order of events that is under refinement already has had its chance.
+            for _, timed, proposal in sorted(inserted, key=lambda x: (self.portfolio.knows(x[1][1]), x[0])):
+                plan = self.incumbent.accepted(*timed)
+                if plan is not None:
+                    self.skeletons.realised(proposal)
+                    return self._adopt(plan)
             if not failed:
                 return False
         return False
+
+    def _draft(self) -> bool:
+        """Every other time, put the cheapest skeletons under refinement as they are; whether there was a new one.
+
+        Each robot is scheduled as if it were alone: where the others let it pass after some pushing and pulling, that
+        costs little more than the skeleton promised.
+        """
+        self._drafting = not self._drafting
+        if not self._drafting:
+            return False
+        drafts = []
+        for proposal in itertools.islice(self.skeletons.propose(_HOPE * self._to_beat(), _THOROUGH), _SKETCHED):
+            self.skeletons.realised(proposal)
+            timed = self.growth.insert(proposal, self.skeletons, self.root, alone=True)
+            drafts += [timed] if timed is not None else []
+        return self.portfolio.add_drafts(drafts, _DRAFTS) > 0
+
+    def _cheapest_insertion(self, proposal: Proposal) -> tuple[float, Timed] | None:
+        """The cheapest of several realisations of a skeleton in space and time, with its cost; None if the first fails.
+
+        They differ by chance, and what starts cheaper usually ends cheaper: far less work than refining all of them.
+        Before there is a plan, more than one is tried only where the first is much dearer than the skeleton promised.
+        """
+        best: tuple[float, Timed] | None = None
+        for k in range(_INSERTIONS):
+            timed = self.growth.insert(proposal, self.skeletons, self.root, varied=k > 0)
+            if timed is not None:
+                cost = plan_cost(*timed, self.problem.cost)
+                if best is None or cost < best[0]:
+                    best = cost, timed
+            if best is None or (self.best is None and best[0] < _POOR * proposal.skeleton.cost):
+                break
+        return best
 
     def _adopt(self, plan: Plan) -> bool:
         """A checked plan that the tree does not have yet: into the tree, and under refinement."""
@@ -555,7 +600,7 @@ class Planner:
 
     def _refine(self) -> bool:
         """Give refinement its turn; whether there is a better plan."""
-        plan = self.portfolio.improve(self._cost())
+        plan = self.portfolio.improve(self._to_beat())
         better = plan is not None and self._offer(plan)
         for settled in self.portfolio.settled() if self._uses("adoption") else []:
             self.skeletons.learn(settled)
@@ -585,6 +630,20 @@ class Planner:
         for orbits in self.graphs.orbits_of.values():
             if orbits:
                 yield self.graphs.mode(orbits[0])
+
+    @property
+    def sampled_bound(self) -> float | None:
+        """No plan over the transitions sampled so far costs less; None where skeletons say nothing."""
+        return self.skeletons.bound
+
+    def counts(self) -> dict[str, int]:
+        """What was done, in numbers that do not depend on the machine: collision checks, IK calls and more."""
+        return {**self._counts.as_dict(), "ik_calls": self._counts.ik_attempts}
+
+    @property
+    def trouble(self) -> Mapping[tuple[str, str], int]:
+        """(robot, what was in its way) -> number of motions that failed for it."""
+        return self.growth.motion.trouble
 
     def explain(self) -> str:
         """Why there is no plan yet: per stratum what was tried and what stopped it, and who blocked whose motion."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from mrtamp.collision import RESOLUTION, Collision
 from mrtamp.incumbent import Incumbent
 from mrtamp.optimise import Optimiser
-from mrtamp.plan import Plan
+from mrtamp.plan import Plan, Segment, Transition
 from mrtamp.problem import Problem
 from mrtamp.refine import Refiner
 from mrtamp.roadmap import Roadmap
@@ -20,7 +20,7 @@ from mrtamp.validity import Validity
 SIZE = 6
 _SLICE = 40
 """Proposals of shortening per turn."""
-_SHORTENING = 6
+_SHORTENING = 1
 """Proposals, per robot and transition, after which shortening gives way to convex programming."""
 _ALONE = 1200
 """The same where there is no convex programming."""
@@ -44,9 +44,13 @@ WORTH_CHECKING = 0.002
 
 @dataclass(eq=False)
 class _Entry:
-    """A checked plan and what works on it: shortening first, then convex programming."""
+    """A checked plan and what works on it: shortening first, then convex programming.
+
+    A draft is no plan yet: its robots still collide with each other, and convex programs have to pull them apart.
+    """
 
     plan: Plan
+    draft: bool = False
     resolution: float = RESOLUTION
     refiner: Refiner | None = None
     optimiser: Optimiser | None = None
@@ -117,7 +121,7 @@ class Portfolio:
 
         When there are too many the dearest goes, those that are finished first.
         """
-        alike = [e for e in self._entries if _order(e.plan) == _order(plan)]
+        alike = [e for e in self._entries if _order(e.plan.transitions) == _order(plan.transitions)]
         if round(plan.cost, 6) in self._seen or any(abs(e.cost - plan.cost) < _ALIKE * plan.cost for e in alike):
             return False
         self._seen.add(round(plan.cost, 6))
@@ -126,6 +130,28 @@ class Portfolio:
             finished = [e for e in self._entries[:-1] if e.done] or self._entries[:-1]
             self._entries.remove(max(finished, key=lambda e: e.cost))
         return True
+
+    def knows(self, transitions: Sequence[Transition]) -> bool:
+        """Whether a plan with the same order of events is under refinement."""
+        return any(_order(e.plan.transitions) == _order(transitions) for e in self._entries)
+
+    def add_drafts(self, drafts: Sequence[tuple[list[Segment], list[Transition]]], most: int) -> int:
+        """Put motions that are free of collision but for that of robots with each other under convex programming.
+
+        Of all drafts those are kept, up to `most`, that promise most: cheap, and not deep in collision.
+        """
+        entries = []
+        for segments, transitions in drafts:
+            plan = self.incumbent.plan(segments, transitions)
+            if round(plan.cost, 6) not in self._seen:
+                self._seen.add(round(plan.cost, 6))
+                entry = _Entry(plan, draft=True)
+                entry.optimiser = self._optimiser(entry)
+                entries.append((entry.optimiser.merit, entry))
+        # The most promising goes first: among those on trial the newest does.
+        kept = [entry for _, entry in sorted(entries, key=lambda x: x[0])][:most][::-1]
+        self._entries += kept
+        return len(kept)
 
     def improve(self, incumbent: float) -> Plan | None:
         """Give one plan its turn; a checked plan when it is clearly cheaper than `incumbent`."""
@@ -137,7 +163,7 @@ class Portfolio:
         entry.optimiser.step()
         entry.trail.append(entry.optimiser.outlook)
         plan = self._offer(entry, incumbent, entry.optimiser)
-        if entry.optimiser.converged or entry.slow:
+        if entry.optimiser.converged or entry.slow or entry.optimiser.stuck:
             self._finish(entry)
         return plan
 
@@ -196,23 +222,31 @@ class Portfolio:
         else:
             entry.resolution /= 2
         entry.refiner = None
-        entry.optimiser = Optimiser(
+        entry.optimiser = self._optimiser(entry)
+
+    def _optimiser(self, entry: _Entry) -> Optimiser:
+        return Optimiser(
             self.problem,
             self.collision,
             entry.plan.segments,
             entry.plan.transitions,
             self.sampler.families,
             slide=self.sliding,
+            draft=entry.draft,
             # Finer steps beside bends gain little: they wait until a plan has proved itself.
             levels=entry.rounds,
         )
 
     def _finish(self, entry: _Entry) -> None:
-        """Convergence: what was gained decides whether the plan is worth another round."""
-        if entry.optimiser is not None and entry.optimiser.cost < entry.plan.cost - 1e-9:
-            plan = self.incumbent.accepted(entry.optimiser.segments(), entry.optimiser.transitions)
+        """Convergence: what was gained decides whether the plan is worth another round; a draft is given up."""
+        work = entry.optimiser
+        if work is not None and np.isfinite(work.cost) and (entry.draft or work.cost < entry.plan.cost - 1e-9):
+            plan = self.incumbent.accepted(work.segments(), work.transitions)
             if plan is not None:
-                entry.plan = plan
+                entry.plan, entry.draft = plan, False
+        if entry.draft:
+            self._entries.remove(entry)
+            return
         gained = entry.before - entry.plan.cost > WORTH_CHECKING * entry.plan.cost
         entry.fruitless = 0 if gained else entry.fruitless + 1
         entry.rounds += 1
@@ -232,7 +266,7 @@ class Portfolio:
         plan = self.incumbent.plan(work.segments(), work.transitions)
         report = self.incumbent.judge(plan)
         if report.ok:
-            entry.plan = plan
+            entry.plan, entry.draft = plan, False
             if isinstance(work, Optimiser):
                 work.confirm()
             return plan
@@ -257,5 +291,5 @@ class Portfolio:
         )
 
 
-def _order(plan: Plan) -> tuple:
-    return tuple((a.kind, a.robots, a.object, a.subgoal) for t in plan.transitions for a in t.actions)
+def _order(transitions: Sequence[Transition]) -> tuple:
+    return tuple((a.kind, a.robots, a.object, a.subgoal) for t in transitions for a in t.actions)

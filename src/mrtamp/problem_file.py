@@ -60,7 +60,7 @@ def load_problem(source: str | Path | dict[str, Any], **params: int) -> Problem:
     source
         The path of a problem file, the name of a shipped task (see `list_problems`), or the file's content as a dict.
     params
-        Parameters of a generated task: `robots`, `objects` and `layout_seed` of `pick_place`.
+        Parameters of a generated task, as of `mrtamp.tasks.pick_place`: `robots`, `objects`, `layout_seed`.
 
     Raises
     ------
@@ -114,15 +114,23 @@ def _shipped_problems() -> dict[str, Path]:
 
 
 def _generators() -> dict[str, Callable[..., Problem]]:
-    from mrtamp import tasks  # here, because the generators build their problems with this module
+    from mrtamp import instances, tasks  # here, because the generators build their problems with this module
 
-    return {"pick_place": tasks.pick_place}
+    made = (
+        tasks.pick_place,
+        instances.clutter,
+        instances.box_layout,
+        instances.handover_layout,
+        instances.stacking_layout,
+    )
+    return {generator.__name__: generator for generator in made}
 
 
 def _refuse(params: dict[str, int], name: str) -> None:
     if params:
         raise ProblemError(
-            f"found the parameters {', '.join(params)} for {name}, expected none: only pick_place has any"
+            f"found the parameters {', '.join(params)} for {name}, expected none: only "
+            f"{', '.join(_generators())} have any"
         )
 
 

@@ -17,10 +17,10 @@ LOG_PERIOD = 2.0
 """Seconds between two lines in a file or a pipe."""
 
 
-def status_text(status: Status | None, elapsed_s: float) -> str:
-    """One line: the time, the phase, how far the search has come and the cost of the incumbent."""
-    if status is None:
-        return f"{elapsed_s:6.1f} s  preparing"
+def status_text(status: Status | str | None, elapsed_s: float) -> str:
+    """One line: the time, the phase, how far the search has come and the cost of the incumbent; or ready words."""
+    if status is None or isinstance(status, str):
+        return f"{elapsed_s:6.1f} s  {status or 'preparing'}"
     parts = [f"{status.modes:,} modes", f"{status.nodes:,} nodes"]
     if status.cost is not None:
         parts.insert(0, f"cost {status.cost:.3f}")
@@ -71,7 +71,7 @@ class ProgressLine:
     def __init__(self, stream: TextIO, *, enabled: bool = True) -> None:
         self._line = LastLine(stream)
         self._enabled = enabled
-        self._status: Status | None = None
+        self._status: Status | str | None = None
         self._started = time.monotonic()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -89,7 +89,7 @@ class ProgressLine:
             self._thread.join()
             self._line.clear()
 
-    def __call__(self, status: Status) -> None:
+    def __call__(self, status: Status | str) -> None:
         self._status = status
 
     def _run(self) -> None:

@@ -164,6 +164,7 @@ def summary(plan: Plan) -> dict[str, Any]:
     return {
         "problem": plan.problem.name,
         "seed": plan.seed,
+        **({"found_by": plan.found_by} if plan.found_by else {}),
         "cost": plan.cost,
         **measures(plan.segments),
         "duration_s": Playback(plan).duration,

@@ -52,6 +52,8 @@ class Roadmap:
         self._spheres: dict[int, np.ndarray] = {}
         # Points of the hand (and of the largest object it may carry) that rotate far from any body's centre.
         self._points = np.array([[0, 0, 0], [reach, 0, 0], [0, reach, 0], [0, 0, reach]])
+        self.inserted: Callable[[str, int], object] | None = None
+        """Called with the robot and every new edge, where edges are not to wait until a search asks about them."""
 
     @property
     def q(self) -> np.ndarray:
@@ -116,6 +118,8 @@ class Roadmap:
             self._adjacent[a].append(b)
             self._adjacent[b].append(a)
             self._arcs.add(a, b, e)
+            if self.inserted is not None:
+                self.inserted(self.name, e)
         return e
 
     def length(self, a: int, b: int) -> float:
@@ -188,6 +192,15 @@ class Roadmap:
     def neighbours(self, a: int) -> Sequence[int]:
         """Vertices that share an edge with `a`, in the order in which the edges were made."""
         return self._adjacent[a]
+
+    def chains(self, v: int) -> list[list[int]]:
+        """The chains of a contact vertex, each from the vertex next to it outwards; none for other vertices."""
+        out: list[list[int]] = []
+        for w in self.exits.get(v, []):
+            if not out or w in self._adjacent[v]:
+                out.append([])
+            out[-1].append(w)
+        return out
 
     def open_vertices(self) -> Sequence[int]:
         """Vertices that are not transitions or their chains."""

@@ -143,7 +143,7 @@ class Steering:
 
         for other, v in standing.items():
             # Verdicts of earlier searches hide behind the mask: they name blockers too.
-            if self.validity.label((robot, mode.held.get(robot), other, v, mode.held.get(other))).hit:
+            if self.validity.known(mode, (robot, mode.held.get(robot), other, v, mode.held.get(other))).hit:
                 blockers[other] += 1
         blocked = self.validity.blocked(robot, mode, standing)
         if detour:

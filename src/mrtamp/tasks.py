@@ -19,6 +19,7 @@ from mrtamp.problem import Problem, ProblemError
 MAX_ROBOTS = 8
 MAX_OBJECTS = 24
 CUBE = 0.05
+WOOD = [0.82, 0.76, 0.68]
 # Centres of two cubes this far apart leave 9 cm between parallel ones and 7 cm between corners: an open gripper fits.
 SPACING = 0.1402
 BASE_CLEARANCE = 0.30
@@ -67,12 +68,17 @@ def pick_place(robots: int = 2, objects: int = 4, layout_seed: int = 0) -> Probl
     """
     from mrtamp.problem_file import problem_from_dict  # here, because problem_file lists this generator
 
-    for what, number, most in (("robots", robots, MAX_ROBOTS), ("objects", objects, MAX_OBJECTS)):
-        if not isinstance(number, int) or not 1 <= number <= most:
-            raise ProblemError(f"pick_place: found {what}={number!r}, expected a whole number from 1 to {most}")
-    if not isinstance(layout_seed, int) or layout_seed < 0:
-        raise ProblemError(f"pick_place: found layout_seed={layout_seed!r}, expected a whole number from 0")
+    ensure_whole("pick_place", "robots", robots, 1, MAX_ROBOTS)
+    ensure_whole("pick_place", "objects", objects, 1, MAX_OBJECTS)
+    ensure_whole("pick_place", "layout_seed", layout_seed, 0)
     return problem_from_dict(pick_place_dict(robots, objects, layout_seed))
+
+
+def ensure_whole(task: str, parameter: str, number: object, least: int, most: int | None = None) -> None:
+    """Refuse a parameter of a generated task that is no whole number within its range, ends included."""
+    if not isinstance(number, int) or number < least or (most is not None and number > most):
+        upto = "" if most is None else f" to {most}"
+        raise ProblemError(f"{task}: found {parameter}={number!r}, expected a whole number from {least}{upto}")
 
 
 def pick_place_dict(robots: int, objects: int, layout_seed: int = 0) -> dict[str, Any]:
@@ -88,7 +94,7 @@ def pick_place_dict(robots: int, objects: int, layout_seed: int = 0) -> dict[str
         "name": f"{name}_seed{layout_seed}" if layout_seed else name,
         "description": f"Simple pick and place: {robots} robots, {objects} cubes, layout {layout_seed}.",
         "robots": [
-            {"name": f"arm{i + 1}", "model": "panda", "X_WB": _pose(np.array([x, y]), 0.0, yaw)}
+            {"name": f"arm{i + 1}", "model": "panda", "X_WB": pose(np.array([x, y]), 0.0, yaw)}
             for i, (x, y, yaw) in enumerate(bases)
         ],
         "world": [
@@ -96,28 +102,34 @@ def pick_place_dict(robots: int, objects: int, layout_seed: int = 0) -> dict[str
                 "name": "table",
                 "shape": {"box": [side, side, 0.1]},
                 "X_WB": {"translation": [0.0, 0.0, -0.05]},
-                "color": [0.82, 0.76, 0.68],
+                "color": WOOD,
             }
         ],
         "objects": [
             {
                 "name": f"cube{i + 1}",
                 "shape": {"box": [CUBE] * 3},
-                "color": [round(c, 3) for c in colorsys.hsv_to_rgb(i / objects, 0.75, 0.85)],
-                "start": {"on": "table", "X_WO": _pose(starts[i], CUBE / 2, yaws[0, i])},
+                "color": color(i, objects),
+                "start": {"on": "table", "X_WO": pose(starts[i], CUBE / 2, yaws[0, i])},
             }
             for i in range(objects)
         ],
         "goal": [
-            {"object": f"cube{i + 1}", "at": _pose(goals[i], CUBE / 2, yaws[1, i]), "on": "table"}
+            {"object": f"cube{i + 1}", "at": pose(goals[i], CUBE / 2, yaws[1, i]), "on": "table"}
             for i in range(objects)
         ],
     }
 
 
-def _pose(xy: np.ndarray, z: float, yaw_deg: float) -> dict[str, Any]:
+def pose(xy: np.ndarray, z: float, yaw_deg: float) -> dict[str, Any]:
+    """A pose as in a problem file, from a point (2,) and a height (m) and a turn about the vertical (degrees)."""
     rounded = [round(float(v), 4) for v in (*xy, z)]
     return {"translation": rounded, "rotation": {"rpy_deg": [0.0, 0.0, round(float(yaw_deg), 2)]}}
+
+
+def color(i: int, n: int) -> list[float]:
+    """The i-th of n colours that are easy to tell apart."""
+    return [round(c, 3) for c in colorsys.hsv_to_rgb(i / n, 0.75, 0.85)]
 
 
 def ring(robots: int) -> np.ndarray:

@@ -48,9 +48,15 @@ class Resting:
 
 
 class Validity:
-    """Cached verdicts on edges of all roadmaps."""
+    """Cached verdicts on edges of all roadmaps.
 
-    def __init__(self, problem: Problem, collision: Collision, roadmaps: Mapping[str, Roadmap]) -> None:
+    Without `remember`, verdicts are kept for the mode they were asked for only: nothing is shared between modes.
+    """
+
+    def __init__(
+        self, problem: Problem, collision: Collision, roadmaps: Mapping[str, Roadmap], *, remember: bool = True
+    ) -> None:
+        self.remember = remember
         self.collision = collision
         self.roadmaps = roadmaps
         self.counts = collision.counts
@@ -69,6 +75,18 @@ class Validity:
         if found is None:
             found = self._labels[key] = Label()
         return found
+
+    def key(self, mode: Mode, key: Hashable) -> Hashable:
+        """What a factor is known by in `mode`: the same in all modes, if they remember."""
+        return key if self.remember else (mode.key, key)
+
+    def known(self, mode: Mode, key: Hashable) -> Label:
+        """The label of a factor, as far as it may be used in `mode`."""
+        return self.label(self.key(mode, key))
+
+    def insert(self, robot: str, e: int) -> None:
+        """Ask at once whether the robot, with its hand empty, may move along a new edge in the static world."""
+        self._ask(robot, e, None, self.label((robot, None, None)), [])
 
     def world_pose(self, chain: tuple[Attachment, ...]) -> np.ndarray:
         """World pose (4, 4) of an object at rest, from its chain of attachments."""
@@ -97,6 +115,7 @@ class Validity:
         keys: list[Hashable] = [(robot, held, None)]
         keys += [(robot, held, r.chain) for r in self.resting(mode)]
         keys += [(robot, held, other, v, mode.held.get(other)) for other, v in at.items() if other != robot]
+        keys = [*dict.fromkeys([*(self.key(mode, k) for k in keys), *keys[:1]])]
         for key in keys:
             found = self._labels.get(key)
             if found is not None and found.hit:
@@ -107,13 +126,16 @@ class Validity:
     def edge(self, robot: str, e: int, mode: Mode) -> bool:
         """Whether the robot, with what it holds, may move along edge e in `mode`, other robots aside."""
         held = mode.held.get(robot)
-        static = self.label((robot, held, None))
+        static = self.known(mode, (robot, held, None))
         verdict = static.get(e)
         if verdict is False or e in self._forbidden.get((robot, mode.attachments), ()):
             return False
+        if not self.remember and e in self.label((robot, held, None)).hit:
+            # Found out when the edge was made.
+            return False
         unknown: list[tuple[Resting, Label]] = []
         for item in self.resting(mode):
-            factor = self.label((robot, held, item.chain))
+            factor = self.known(mode, (robot, held, item.chain))
             known = factor.get(e)
             if known is False:
                 return False
@@ -191,7 +213,7 @@ class Validity:
     def against(self, robot: str, e: int, mode: Mode, other: str, v: int) -> bool:
         """Whether the robot may move along edge e while `other` stands at its vertex v."""
         held, other_held = mode.held.get(robot), mode.held.get(other)
-        factor = self.label((robot, held, other, v, other_held))
+        factor = self.known(mode, (robot, held, other, v, other_held))
         known = factor.get(e)
         if known is not None:
             return known
@@ -205,7 +227,7 @@ class Validity:
         if a > b:
             a, edge_a, b, edge_b = b, edge_b, a, edge_a
         held_a, held_b = mode.held.get(a), mode.held.get(b)
-        key = (a, edge_a, held_a, b, edge_b, held_b)
+        key = self.key(mode, (a, edge_a, held_a, b, edge_b, held_b))
         known = self._moves.get(key)
         if known is None:
             ea, eb = self.roadmaps[a].edge(*edge_a), self.roadmaps[b].edge(*edge_b)
@@ -279,15 +301,15 @@ class Validity:
             if obstacle is None:
                 self._forbidden.setdefault((robot, mode.attachments), set()).add(edges[robot])
             else:
-                self.label((robot, mode.held.get(robot), chains.get(obstacle))).put(edges[robot], False)
+                self.known(mode, (robot, mode.held.get(robot), chains.get(obstacle))).put(edges[robot], False)
             return
         one, two = sorted(guilty)
         moving = [r for r in (one, two) if a[r] != b[r]]
         if len(moving) == 2:
             key = (one, (a[one], b[one]), mode.held.get(one), two, (a[two], b[two]), mode.held.get(two))
-            self._moves[key] = False
+            self._moves[self.key(mode, key)] = False
             return
         for robot in moving or [one]:
             other = two if robot == one else one
-            factor = self.label((robot, mode.held.get(robot), other, a[other], mode.held.get(other)))
+            factor = self.known(mode, (robot, mode.held.get(robot), other, a[other], mode.held.get(other)))
             factor.put(edges[robot], False)

@@ -6,7 +6,17 @@ from xml.etree import ElementTree
 
 import pytest
 
-from mrtamp.convergence import KNOWN, ROUNDING, Curve, KnownOptimum, Panel, convergence, drawing, mean_curve, optimum
+from mrtamp.bench.convergence import (
+    KNOWN,
+    ROUNDING,
+    Curve,
+    KnownOptimum,
+    Panel,
+    convergence,
+    drawing,
+    mean_curve,
+    optimum,
+)
 from mrtamp.planner import Planner
 from mrtamp.problem_file import load_problem
 

@@ -8,7 +8,7 @@ strata, checks the result as finely as the planner does, and keeps it if it is c
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -35,6 +35,8 @@ _SLIDING = 0.2
 _LARGEST, _SMALLEST = 0.5, 0.01
 _DEEP = 0.06
 """Penetration (m) at which a step is rejected."""
+_LINGER, _LODGED, _YIELDS = 5, 0.004, 0.8
+"""Steps in which a draft whose robots penetrate by more than that (m) has to reduce it to that share."""
 _SHALLOW = 1e-3
 """Penetration (m) at the program's own samples that makes a finer look pointless."""
 _TRUE, _FALSE = 0.7, 0.25
@@ -71,10 +73,12 @@ class Optimiser:
     knot : length (rad) of the steps of the polyline.
     levels : how often steps beside bends are halved, each time the one before has converged.
     slide : whether transitions may slide along their strata; otherwise their configurations stay as they are.
+    draft : whether robots may still collide with each other in what is given.
 
     Attributes
     ----------
-    cost : cost of the best polyline without violations, transitions included.
+    cost : cost of the best polyline without violations, transitions included; infinite while a draft has none.
+    stuck : whether a draft does not come free of collision.
     steps : conic programs solved so far.
     converged : whether further steps promise nothing.
     """
@@ -90,6 +94,7 @@ class Optimiser:
         knot: float = 0.27,
         levels: int = LEVELS,
         slide: bool = True,
+        draft: bool = False,
     ) -> None:
         self.problem = problem
         self.weights = problem.cost
@@ -117,6 +122,9 @@ class Optimiser:
         line = load(segments, transitions, {r: w.tool for r, w in self.worlds.items()})
         self._best = self._sure = self._iterate(line, line.q, self.choices.at(self.choices.start))
         self._now = self._best
+        if draft:
+            self._best = self._sure = replace(self._best, cost=np.inf)
+        self._depths: list[float] = []
         self._rows: CollisionRows | None = None
         self._resample()
 
@@ -189,6 +197,19 @@ class Optimiser:
         self._now, self._rows = iterate, None
         self._adopt(iterate)
 
+    @property
+    def merit(self) -> float:
+        """Cost of the current iterate with what its penetrations are charged."""
+        if self._rows is None:
+            self._rows = self.collisions.rows(self._now.line, self._now.q, self._now.arrangement)
+        return self._merit(self._now, self._rows)
+
+    @property
+    def stuck(self) -> bool:
+        """Whether a draft has not come out of collision and does not get any further."""
+        depths = self._depths[-_LINGER:]
+        return np.isinf(self.cost) and len(depths) == _LINGER and depths[-1] > max(_LODGED, _YIELDS * depths[0])
+
     # -- one step ---------------------------------------------------------------------------------------------------
 
     def step(self) -> float:
@@ -207,11 +228,15 @@ class Optimiser:
         candidate = self._resampled(solved) if self._stretched(solved) else solved
         where = (candidate.line, candidate.q, candidate.arrangement)
         rows = self.collisions.rows(*where)
-        deepest = rows.deepest(self.problem.collision.tolerance)
-        if deepest > max(_DEEP, self._rows.deepest(self.problem.collision.tolerance)):
+        before = self._merit(now, self._rows)
+        tolerance = self.problem.collision.tolerance
+        deepest = rows.deepest(tolerance)
+        worse = deepest > max(_DEEP, self._rows.deepest(tolerance))
+        if worse and not (np.isinf(self.cost) and self._merit(candidate, rows) < before):
+            self._depths.append(self._rows.deepest(tolerance))
             self.collisions.demands = demands
             return self._reject()
-        before = self._merit(now, self._rows)
+        self._depths.append(deepest)
         self._now = candidate
         if candidate.line is not now.line:
             self._adopt(candidate)

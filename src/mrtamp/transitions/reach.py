@@ -172,6 +172,10 @@ class ReachSampler:
         q, on = target.sample(self.workspace.rng, n, self.workspace.near(robot))
         stats.samples += len(q)
         stats.ik_solved += int(on.sum())
+        if not isinstance(target.target, AtConfiguration):
+            counts = self.workspace.collision.counts
+            counts.ik_attempts += len(q)
+            counts.ik_successes += int(on.sum())
         fresh: list[int] = []
         for x in q[on]:
             rows = world.rows(x[None], None, {})

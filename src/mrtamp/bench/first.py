@@ -12,8 +12,8 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from mrtamp.bench_run import Task, Tell, apart, peak_mb, pick_place
-from mrtamp.bench_table import Line
+from mrtamp.bench.run import Task, Tell, apart, peak_mb, pick_place
+from mrtamp.bench.table import Line
 
 FIRST_BUDGET_S = 60.0
 

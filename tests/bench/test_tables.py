@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrtamp import bench, bench_ablation, bench_costs, bench_endurance
-from mrtamp.bench_ablation import ABLATION, ablation, with_references
-from mrtamp.bench_best import Best, BestKnown, best_known_file
-from mrtamp.bench_costs import COSTS, CostRow, cost_row, costs
-from mrtamp.bench_endurance import course, endurance, endurance_row, growth, sampled
-from mrtamp.bench_run import Point, Run, Setting, Stopped, Task, apart, measure, pick_place
-from mrtamp.bench_table import Line
-from mrtamp.mechanisms import MECHANISMS
+from mrtamp.bench import costs as costs_module
+from mrtamp.bench import endurance as endurance_module
+from mrtamp.bench import first
+from mrtamp.bench.best import Best, BestKnown, best_known_file
+from mrtamp.bench.costs import COSTS, CostRow, cost_row, costs
+from mrtamp.bench.endurance import course, endurance, endurance_row, growth, sampled
+from mrtamp.bench.run import Point, Run, Stopped, Task, apart, measure, pick_place
+from mrtamp.bench.table import Line
 from mrtamp.problem import MrtampError
 
 EASY = Task("square_free")
@@ -65,22 +65,22 @@ def run(points: tuple[Point, ...] = FLOW, **changes) -> Run:
 
 
 def test_a_row_is_measured_and_printed(monkeypatch: pytest.MonkeyPatch, line: Line, said: list[str]) -> None:
-    monkeypatch.setattr(bench, "start_to_exit", lambda: 1.0)
-    assert bench.first_plans(1, [bench.Row(Task("box"), 60.0, "10 s")], line)
+    monkeypatch.setattr(first, "start_to_exit", lambda: 1.0)
+    assert first.first_plans(1, [first.Row(Task("box"), 60.0, "10 s")], line)
     assert "| box | 1/1 |" in "\n".join(said)
 
 
 def test_a_row_without_a_plan_counts_as_the_whole_budget(
     monkeypatch: pytest.MonkeyPatch, line: Line, said: list[str]
 ) -> None:
-    monkeypatch.setattr(bench, "start_to_exit", lambda: 1.0)
-    monkeypatch.setattr(bench, "FIRST_BUDGET_S", 0.0)
-    assert not bench.first_plans(1, [bench.Row(Task("stacking"), 60.0, "-")], line)
+    monkeypatch.setattr(first, "start_to_exit", lambda: 1.0)
+    monkeypatch.setattr(first, "FIRST_BUDGET_S", 0.0)
+    assert not first.first_plans(1, [first.Row(Task("stacking"), 60.0, "-")], line)
     assert "| stacking | 0/1 | 0.00 s | nan s |" in "\n".join(said)
 
 
 def test_the_rows_are_the_tasks_of_the_paper() -> None:
-    names = [row.name for row in bench.FIRST]
+    names = [row.name for row in first.FIRST]
     assert names[:4] == ["box", "handover", "stacking", "pick_place 2/2"] and names[-1] == "pick_place 8/24"
 
 
@@ -88,7 +88,7 @@ def test_the_rows_are_the_tasks_of_the_paper() -> None:
 
 
 def test_a_run_knows_its_whole_curve_and_was_checked_from_files(line: Line) -> None:
-    found = measure(EASY, 3, 4.0, line, Setting(without=("coordination",)))
+    found = measure(EASY, 3, 4.0, line)
     assert found.name == "square_free" and found.seed == 3 and found.points and found.flawless and not found.stopped
     assert found.first is not None and found.best is not None and found.best.cost >= 4.06 - 1e-3
     assert found.best.cost == pytest.approx(found.best.makespan + 0.01 * found.best.path_length)
@@ -225,7 +225,7 @@ def test_every_problem_has_a_best_known_cost_in_the_package() -> None:
 def test_costs_are_written_only_when_asked(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, line: Line, said: list[str]
 ) -> None:
-    monkeypatch.setattr(bench_costs, "measure", lambda task, seed, *_: run(seed=seed))
+    monkeypatch.setattr(costs_module, "measure", lambda task, seed, *_: run(seed=seed))
     file = tmp_path / "best.json"
     row = CostRow(EASY, {10: 0.01})
     kept: list[Run] = []
@@ -267,7 +267,7 @@ def test_the_finished_seeds_stay_when_it_is_stopped(
             raise Stopped(None)
         return run(seed=seed)
 
-    monkeypatch.setattr(bench_costs, "measure", stopping)
+    monkeypatch.setattr(costs_module, "measure", stopping)
     with pytest.raises(Stopped):
         costs(5, [10], [CostRow(EASY)], BestKnown(tmp_path / "best.json"), line, command="x", update=True)
     assert "| 2/2 |" in said[1] and "(written)" in said[-1]
@@ -300,7 +300,7 @@ def test_a_long_run_that_is_stopped_is_still_reported(
     def stopping(*_: object, **__: object) -> Run:
         raise Stopped(run(stopped=True))
 
-    monkeypatch.setattr(bench_endurance, "measure", stopping)
+    monkeypatch.setattr(endurance_module, "measure", stopping)
     known = BestKnown(tmp_path / "best.json")
     with pytest.raises(Stopped):
         endurance(10.0, 1, [CostRow(EASY)], known, line, command="x", update=True)
@@ -310,27 +310,3 @@ def test_a_long_run_that_is_stopped_is_still_reported(
 def test_a_short_endurance_run(tmp_path: Path, line: Line, said: list[str]) -> None:
     assert endurance(5 / 60, 1, [CostRow(EASY)], BestKnown(tmp_path / "best.json"), line, command="x")
     assert "| square_free | 0 |" in said[1] and " MB, cost " in said[2]
-
-
-# -- ablation --------------------------------------------------------------------------------------------------------
-
-
-def test_every_mechanism_has_a_row() -> None:
-    off = {row.setting.without for row in ABLATION}
-    assert off == {(), *((name,) for name in MECHANISMS)}
-    assert {row.setting.intra_orbit for row in ABLATION} == {None, "prioritised"}
-
-
-def test_chosen_rows_come_after_their_reference() -> None:
-    chosen = [row for row in ABLATION if row.name == "handover, without sliding"]
-    assert [row.name for row in with_references(chosen)] == ["handover, all on", "handover, without sliding"]
-
-
-def test_ablation_prints_relative_figures(monkeypatch: pytest.MonkeyPatch, line: Line, said: list[str]) -> None:
-    def measured(task: Task, seed: int, budget_s: float, line: Line, setting: Setting) -> Run:
-        return run(FLOW if not setting.without else FLOW[:1])
-
-    monkeypatch.setattr(bench_ablation, "measure", measured)
-    assert ablation(2, 10.0, [row for row in ABLATION if row.name == "handover, without sliding"], line)
-    assert "| handover | all on | 2/2 | 0.50 s | 12.000 | 1.00 | 10.500 | 1.000 | yes |" in said
-    assert "| handover | without sliding | 2/2 | 0.50 s | 12.000 | 1.00 | 12.000 | 1.143 | yes |" in said

@@ -5,10 +5,10 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 
-from mrtamp.bench_best import BestKnown, best_of
-from mrtamp.bench_costs import CostRow, Keep
-from mrtamp.bench_run import Run, Stopped, measure
-from mrtamp.bench_table import Line, header, number, table_row, yes_or_no
+from mrtamp.bench.best import BestKnown, best_of
+from mrtamp.bench.costs import CostRow, Keep
+from mrtamp.bench.run import Run, Stopped, measure
+from mrtamp.bench.table import Line, header, number, table_row, yes_or_no
 
 LIMIT_MB = 2048.0
 """More memory no run may take."""

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mrtamp.bench_run import Run, Task
+from mrtamp.bench.run import Run, Task
 from mrtamp.problem import MrtampError
 
 VERSION = 1

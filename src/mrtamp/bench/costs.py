@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from mrtamp.bench_best import Best, BestKnown, best_of
-from mrtamp.bench_run import Run, Task, measure, pick_place
-from mrtamp.bench_table import Line, header, median, number, table_row, yes_or_no
+from mrtamp.bench.best import Best, BestKnown, best_of
+from mrtamp.bench.run import Run, Task, measure, pick_place
+from mrtamp.bench.table import Line, header, median, number, table_row, yes_or_no
 
 FIRST_AIM = 2.5
 """A first plan may cost at most so many times the best known."""

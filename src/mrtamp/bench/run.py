@@ -15,8 +15,7 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from multiprocessing import get_context
@@ -24,7 +23,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mrtamp.bench_table import Line
+from mrtamp.bench.table import Line
+from mrtamp.workers import uninterrupted
 
 if TYPE_CHECKING:
     from mrtamp.plan import Plan
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 Tell = Callable[[str], None]
 """Says in a few words how far a run has come."""
 
+_END_S = 5.0
+"""Seconds in which a process is over that says nothing more."""
 _PULSE_S = 1.0
 """Seconds between two reports of a run."""
 
@@ -46,10 +48,11 @@ class Task:
 
     @property
     def name(self) -> str:
-        """The problem, with robots/objects where it is generated."""
-        if not self.parameters:
-            return self.problem
-        return f"{self.problem} {self.parameters['robots']}/{self.parameters['objects']}"
+        """The problem, with robots/objects where it is generated; the layout is no part of it."""
+        sizes = {key: number for key, number in self.parameters.items() if key != "layout_seed"}
+        if set(sizes) == {"robots", "objects"}:
+            return f"{self.problem} {sizes['robots']}/{sizes['objects']}"
+        return " ".join([self.problem, *(f"{number} {key}" for key, number in sizes.items())])
 
     def load(self) -> Problem:
         """The problem itself."""
@@ -61,14 +64,6 @@ class Task:
 def pick_place(robots: int, objects: int) -> Task:
     """The scalable task."""
     return Task("pick_place", {"robots": robots, "objects": objects})
-
-
-@dataclass(frozen=True)
-class Setting:
-    """How the planner is set: mechanisms switched off, and the planner of motion inside an orbit (None: default)."""
-
-    without: tuple[str, ...] = ()
-    intra_orbit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -148,20 +143,17 @@ class Stopped(KeyboardInterrupt):
 # -- in the process of the run ---------------------------------------------------------------------------------------
 
 
-def plan_once(task: Task, seed: int, budget_s: float, setting: Setting, tell: Tell) -> Run:
+def plan_once(task: Task, seed: int, budget_s: float, tell: Tell) -> Run:
     """Plan once, in this process; `budget_s` includes the planner's preparation, not imports and loading."""
     from mrtamp.plan import measures
-    from mrtamp.planner import Options, Planner
+    from mrtamp.planner import Planner
 
-    options = Options(without=frozenset(setting.without))
-    if setting.intra_orbit is not None:
-        options = Options(without=frozenset(setting.without), intra_orbit=setting.intra_orbit)
     problem = task.load()
     plans: list[Plan] = []
     stopped = False
-    with _Pulse(tell) as pulse:
+    with Pulse(tell) as pulse:
         try:
-            planner = Planner(problem, seed=seed, options=options)
+            planner = Planner(problem, seed=seed)
             for plan in planner.improve(max(budget_s - planner.status().elapsed_s, 0.0)):
                 plans.append(plan)
                 pulse.cost = plan.cost
@@ -170,10 +162,10 @@ def plan_once(task: Task, seed: int, budget_s: float, setting: Setting, tell: Te
     peak = peak_mb()
     points = tuple(Point(p.history[-1]["time_s"], p.cost, **measures(p.segments)) for p in plans)
     tell(f"checking {len(plans)} plans from their files")
-    return Run(task.name, seed, budget_s, points, tuple(pulse.memory), peak, tuple(_refusals(plans)), stopped)
+    return Run(task.name, seed, budget_s, points, tuple(pulse.memory), peak, tuple(refusals(plans)), stopped)
 
 
-def _refusals(plans: Sequence[Plan]) -> list[str]:
+def refusals(plans: Sequence[Plan]) -> list[str]:
     """What the judge has against plans, each loaded from the file it was saved to."""
     from mrtamp.check import check_plan
     from mrtamp.plan import Plan
@@ -189,7 +181,7 @@ def _refusals(plans: Sequence[Plan]) -> list[str]:
     return out
 
 
-class _Pulse:
+class Pulse:
     """Reports how far a run is and notes its memory, from a thread of its own."""
 
     def __init__(self, tell: Tell) -> None:
@@ -200,7 +192,7 @@ class _Pulse:
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def __enter__(self) -> _Pulse:
+    def __enter__(self) -> Pulse:
         self._thread.start()
         return self
 
@@ -235,44 +227,55 @@ def peak_mb() -> float:
 # -- in the process of whoever measures ------------------------------------------------------------------------------
 
 
-def measure(
-    task: Task, seed: int, budget_s: float, line: Line, setting: Setting | None = None, *, salvage: bool = False
-) -> Run:
+def measure(task: Task, seed: int, budget_s: float, line: Line, *, salvage: bool = False) -> Run:
     """Plan once, in a process of its own; `salvage` as in `apart`.
 
     Raises
     ------
     Stopped : Ctrl-C came.
     """
-    setting = setting or Setting()
-    what = [f"without {name}" for name in setting.without] + ([setting.intra_orbit] if setting.intra_orbit else [])
-    prefix = f"{', '.join([task.name, *what])}, seed {seed}: "
+    prefix = f"{task.name}, seed {seed}: "
     line.show(f"{prefix}starting")
-    return apart(plan_once, task, seed, budget_s, setting, tell=lambda text: line.show(prefix + text), salvage=salvage)
+    return apart(plan_once, task, seed, budget_s, tell=lambda text: line.show(prefix + text), salvage=salvage)
 
 
-def apart(function: Callable[..., Any], *arguments: Any, tell: Tell, salvage: bool = False) -> Any:
+def apart(
+    function: Callable[..., Any],
+    *arguments: Any,
+    tell: Tell,
+    salvage: bool = False,
+    patience: Mapping[str, float] | None = None,
+) -> Any:
     """`function(*arguments, tell)` in a fresh process; what it tells arrives here.
+
+    Parameters
+    ----------
+    patience : what the function tells when it begins something -> seconds after which it has to have begun the next of
+        these, or be finished ("" is the start of the process); then the process is killed.  None: wait for ever.
 
     Raises
     ------
     Stopped : Ctrl-C came; with `salvage`, what the function returned when it was interrupted is attached.
+    TimeoutError : patience came to an end.
     RuntimeError : the function failed (its traceback is the message), or its process was killed.
     """
     context = get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs, function, arguments), daemon=True)
     try:
-        with _uninterrupted():
+        with uninterrupted():
             process.start()
         theirs.close()
         try:
-            return _receive(ours, tell)
+            return _receive(ours, tell, patience)
         except KeyboardInterrupt:
             if not salvage:
                 raise Stopped(None) from None
             process.terminate()
-            raise Stopped(_receive(ours, tell)) from None
+            raise Stopped(_receive(ours, tell, None)) from None
+        except EOFError:
+            process.join(_END_S)
+            raise RuntimeError(f"the process of a run ended before its time: {_ending(process.exitcode)}") from None
     finally:
         ours.close()
         if process.pid is not None:
@@ -280,36 +283,24 @@ def apart(function: Callable[..., Any], *arguments: Any, tell: Tell, salvage: bo
             process.join()
 
 
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Ctrl-C waits for the end of the block, and a process that is made inside it never hears one.
-
-    A process that loses its parent before it has been told what to do would complain with a traceback.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    watched = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda number, _: came.append(number)) for number in watched]
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for number, handler in zip(watched, before, strict=True):
-            signal.signal(number, handler)
-    for late in came:
-        signal.raise_signal(late)
+def _ending(code: int | None) -> str:
+    """What an exit code says, in words."""
+    if code is not None and code < 0:
+        return f"killed by {signal.Signals(-code).name}"
+    return f"exit code {code}"
 
 
-def _receive(connection: Connection, tell: Tell) -> Any:
+def _receive(connection: Connection, tell: Tell, patience: Mapping[str, float] | None) -> Any:
+    doing = ""
+    due = time.monotonic() + patience[doing] if patience else None
     while True:
-        try:
-            kind, content = connection.recv()
-        except EOFError:
-            raise RuntimeError("the process of a run was ended from outside") from None
+        if due is not None and not connection.poll(max(due - time.monotonic(), 0.0)):
+            assert patience is not None
+            raise TimeoutError(f"killed: {doing or 'starting'} took more than {patience[doing]:g} s")
+        kind, content = connection.recv()
         if kind == "told":
+            if patience and content in patience:
+                doing, due = content, time.monotonic() + patience[content]
             tell(content)
         elif kind == "failed":
             raise RuntimeError(content)
@@ -321,12 +312,18 @@ def _serve(connection: Connection, function: Callable[..., Any], arguments: tupl
     # Ctrl-C in a terminal reaches every process of its group; only the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+    def tell(text: str) -> None:
+        try:
+            connection.send(("told", text))
+        except BrokenPipeError:
+            # Nobody waits for this run any more; it would only disturb the next one.
+            os._exit(1)
+
     try:
-        message = ("done", function(*arguments, lambda text: connection.send(("told", text))))
+        message = ("done", function(*arguments, tell))
     except KeyboardInterrupt:
         message = ("done", None)
-    except BrokenPipeError:
-        return
     except BaseException:
         message = ("failed", traceback.format_exc())
     connection.send(message)

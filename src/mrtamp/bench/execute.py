@@ -1,0 +1,120 @@
+"""A suite is run: one run after the other in this process's care, or side by side on workers (`mrtamp.cluster`)."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+from mrtamp.bench.measured import run_assignment, run_on_worker
+from mrtamp.bench.records import Record, Records
+from mrtamp.bench.suite import Assignment, Suite
+from mrtamp.bench.table import Line
+
+_START_S = 2.0
+"""Seconds that a run takes beyond its limit, as long as none has been measured."""
+
+
+def execute(
+    suite: Suite,
+    folder: Path,
+    line: Line,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    again: bool = False,
+    wanted: Callable[[Assignment], bool] = lambda assignment: True,
+) -> list[str]:
+    """Run what has not been run yet; returns what could not be run, in words.
+
+    Parameters
+    ----------
+    folder : of the raw records, see `Records`.
+    workers : runs at the same time; with one and without a scheduler they need no Dask.
+    again : runs that failed (an error, not for lack of a plan) are run once more.
+    wanted : whether a run is to be done.
+
+    Raises
+    ------
+    MrtampError : the folder holds records of another suite; the workers cannot be used.
+    Stopped : Ctrl-C came; what was finished is on the disk.
+    """
+    with Records(folder, suite) as records:
+        done = {record.key for record in records.done if not (again and record.error is not None)}
+        ahead = [a for a in suite.assignments() if wanted(a) and a.key not in done]
+        progress = _Progress(ahead, len(done), workers, line)
+        lost: list[str] = []
+        if not ahead:
+            return lost
+        if workers == 1 and scheduler is None:
+            for assignment in ahead:
+                progress.begin(assignment)
+                record = run_assignment(assignment, partial(progress.tell, assignment.key))
+                records.add(record)
+                progress.finished(record)
+            return lost
+        from mrtamp.cluster import pool
+
+        by_key = {assignment.key: assignment for assignment in ahead}
+        with pool(scheduler, workers) as cluster:
+            progress.workers = max(cluster.size, 1)
+            tasks = ((key, (assignment,)) for key, assignment in by_key.items())
+            for outcome in cluster.run(run_on_worker, tasks, hear=progress.tell):
+                if outcome.error is not None:
+                    lost.append(f"{outcome.key}: {outcome.error.splitlines()[0]}")
+                else:
+                    records.add(outcome.value)
+                    progress.finished(outcome.value)
+        return lost
+
+
+class _Progress:
+    """Says how many runs are done, how long the rest will take, and what the latest of them is at."""
+
+    def __init__(self, ahead: Sequence[Assignment], before: int, workers: int, line: Line) -> None:
+        self.workers = workers
+        self._limits = {assignment.key: assignment.case.limit_s for assignment in ahead}
+        self._total = len(ahead) + before
+        self._extra: list[float] = []
+        self._began = time.monotonic()
+        self._line = line
+
+    def begin(self, assignment: Assignment) -> None:
+        """A run begins; its clock with it."""
+        self._began = time.monotonic()
+        self.tell(assignment.key, "starting")
+
+    def tell(self, key: str, text: str) -> None:
+        """Something is heard of a run."""
+        done = self._total - len(self._limits)
+        self._line.show(f"{done}/{self._total} runs, {duration(self.left())} left; {key}: {text}")
+
+    def finished(self, record: Record) -> None:
+        """A run is over."""
+        self._limits.pop(record.key, None)
+        if record.times is not None:
+            self._extra.append(record.times.wall - record.limit_s)
+        self._began = time.monotonic()
+        self.tell(record.key, "done")
+
+    def left(self) -> float:
+        """Seconds until the end, about."""
+        extra = statistics.mean(self._extra) if self._extra else _START_S
+        rest = sum(limit + extra for limit in self._limits.values())
+        return max(rest / self.workers - (time.monotonic() - self._began), 0.0)
+
+
+def expected_s(suite: Suite) -> float:
+    """Seconds that a suite takes, one run after the other."""
+    return sum(assignment.case.limit_s + _START_S for assignment in suite.assignments())
+
+
+def duration(seconds: float) -> str:
+    """A time to wait, roughly."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    if seconds < 100 * 60:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
