@@ -103,9 +103,9 @@ def test_nothing_is_tried_that_cannot_beat_the_bound(tmp_path: Path, monkeypatch
         counts = {"skeletons": 0, "refined": 0}
         insert, improve = planner.growth.insert, planner.portfolio.improve
 
-        def counted_insert(*arguments: object) -> object:
+        def counted_insert(*arguments: object, **how: bool) -> object:
             counts["skeletons"] += 1
-            return insert(*arguments)
+            return insert(*arguments, **how)
 
         def counted_improve(to_beat: float) -> Plan | None:
             assert to_beat <= bound

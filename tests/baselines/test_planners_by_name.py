@@ -93,7 +93,7 @@ def fingerprint(name: str) -> str:
 
 @pytest.mark.parametrize("name", BASELINES)
 def test_equal_seeds_give_equal_runs_in_any_process(name: str) -> None:
-    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_planners as t; "
+    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_planners_by_name as t; "
     other = subprocess.Popen(
         [sys.executable, "-c", code + f"print(t.fingerprint({name!r}))"],
         env={**os.environ, "PYTHONHASHSEED": "77"},

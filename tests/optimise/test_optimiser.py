@@ -202,3 +202,40 @@ def test_two_arms() -> None:
         run(scp, 5)
         report = judged(scp)
     assert report.ok
+
+
+def crossing(folder: Path) -> Plan:
+    """A disc goes past another one, through its edge."""
+    start = {r.name: r.start for r in disc_problem(folder).robots}
+    ends = {"a": np.array([1.3, 0.18]), "b": start["b"]}
+    problem = discs(folder, goal=tuple(RobotAt(r, q) for r, q in ends.items()))
+    plan = Errands(problem).move(**{r: tuple(q) for r, q in ends.items()}).plan()
+    assert {v.kind for v in Checker(problem).check(plan).violations} == {"collision"}
+    return plan
+
+
+def test_a_draft_is_pulled_apart(tmp_path: Path) -> None:
+    plan = crossing(tmp_path)
+    scp = optimiser(plan, draft=True)
+    assert scp.cost == np.inf and scp.outlook < np.inf and scp.merit > plan.cost
+    for _ in range(30):
+        scp.step()
+        if np.isfinite(scp.cost):
+            break
+    assert plan.cost - 1e-3 < scp.cost < 1.1 * plan.cost, "one of them has to move aside a little"
+    assert not scp.stuck
+    run(scp)
+    assert judged(scp).ok
+
+
+def test_a_draft_that_cannot_come_free_is_stuck(tmp_path: Path) -> None:
+    """The discs are to end inside each other: no motion makes that right."""
+    start = {r.name: r.start for r in disc_problem(tmp_path).robots}
+    middle = (start["a"] + start["b"]) / 2
+    inside = middle + np.array([0.05, 0.0])
+    problem = discs(tmp_path, goal=(RobotAt("a", middle), RobotAt("b", inside)))
+    plan = Errands(problem).move(a=tuple(middle), b=tuple(inside)).plan()
+    scp = optimiser(plan, draft=True)
+    for _ in range(30):
+        scp.step()
+    assert scp.stuck and scp.cost == np.inf
