@@ -65,6 +65,8 @@ _SKETCHED, _DRAFTS = 4, 3
 """Skeletons that are drafted at a time, and drafts of them that are refined."""
 _POOR = 2.0
 """A first realisation that costs so many times what its skeleton promised is not the only one."""
+_MANY = 12
+"""Stops from which on a realisation takes too long for that."""
 _HOPE = 1.0
 """Skeletons are realised while their estimate is less than the incumbent's cost times this."""
 _TIE = 0.25
@@ -519,7 +521,7 @@ class Planner:
         """The cheapest of several realisations of a skeleton in space and time, with its cost; None if the first fails.
 
         They differ by chance, and what starts cheaper usually ends cheaper: far less work than refining all of them.
-        Before there is a plan, more than one is tried only where the first is much dearer than the skeleton promised.
+        Before there is a plan, more than one is tried only where that is quick and the first far dearer than promised.
         """
         best: tuple[float, Timed] | None = None
         for k in range(_INSERTIONS):
@@ -528,7 +530,8 @@ class Planner:
                 cost = plan_cost(*timed, self.problem.cost)
                 if best is None or cost < best[0]:
                     best = cost, timed
-            if best is None or (self.best is None and best[0] < _POOR * proposal.skeleton.cost):
+            good = best is not None and best[0] < _POOR * proposal.skeleton.cost
+            if best is None or (self.best is None and (good or len(proposal.stops) > _MANY)):
                 break
         return best
 
