@@ -7,7 +7,6 @@ points. Tests that need it are skipped elsewhere.
 import json
 import os
 import time
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
@@ -373,10 +372,18 @@ def test_one_check_takes_at_most_two_thirds_of_the_official_models_time() -> Non
         for k, cube in enumerate(scene.cubes):
             scene.plant.SetFreeBodyPose(scene.context, cube, RigidTransform([0, 0.2 * k - 0.5, 0.025]))
 
-    def seconds(check: Callable[[], bool]) -> float:
-        start = time.perf_counter()
-        check()
-        return time.perf_counter() - start
+    def seconds(scene: Scene, q: np.ndarray) -> float:
+        # The best of three: what else the machine is doing only ever adds. Setting the positions again makes
+        # Drake forget the poses, so each of the three is a whole check.
+        best = np.inf
+        for _ in range(3):
+            for arm in range(2):
+                scene.set_arm(q[arm], arm=arm)
+            query = scene.query()
+            start = time.perf_counter()
+            query.HasCollisions()
+            best = min(best, time.perf_counter() - start)
+        return best
 
     rng = np.random.default_rng(5)
     ratios = []
@@ -384,13 +391,7 @@ def test_one_check_takes_at_most_two_thirds_of_the_official_models_time() -> Non
         times = []
         for _ in range(400):
             q = np.array(scenes[0].robot["home"]) + rng.uniform(-0.8, 0.8, (2, 7))
-            row = []
-            for scene in scenes:
-                for arm in range(2):
-                    scene.set_arm(q[arm], arm=arm)
-                query = scene.query()
-                row.append(seconds(query.HasCollisions))
-            times.append(row)
+            times.append([seconds(scene, q) for scene in scenes])
         ours, official = np.median(times, axis=0)
         ratios.append(ours / official)
     # The median over repetitions: a burst of load on the machine spoils one of them, not three.
