@@ -261,6 +261,8 @@ def test_every_check_is_counted(problem: Problem) -> None:
     world.hits(world.rows(np.zeros((5, 4)), None, {}))
     assert counts.collision_checks == 5
     assert counts.as_dict()["collision_checks"] == 5
+    counts.ik_attempts = 7
+    assert counts.work() == {**counts.as_dict(), "ik_calls": 7}, "what planners are compared by has a name of its own"
 
 
 def test_attachments_are_compared_by_identity() -> None:

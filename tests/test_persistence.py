@@ -144,7 +144,7 @@ def test_every_orbit_and_every_modal_state_keeps_its_share_of_exploration(tmp_pa
     living = [o for o, nodes in planner.tree.of_orbit.items() if nodes]
     states = {planner.graphs.mode(o).state for o in living}
     n = 4000
-    drawn = Counter(planner._any_orbit() for _ in range(n))
+    drawn = Counter(planner.orbit_guidance.any_orbit() for _ in range(n))
     assert set(drawn) == set(living)
     assert min(drawn.values()) > 0.5 * n / 2 / len(living)
     of_state = Counter[tuple]()
@@ -170,5 +170,5 @@ def test_the_share_of_unguided_draws_is_the_option(tmp_path: Path, persistent: f
     planner.guidance.feasible_sets = lambda mode, rng: draws.update(["free"]) or []  # type: ignore[func-returns-value]
     n = 1500
     for _ in range(n):
-        planner._guide()
+        planner.orbit_guidance.choose(improving=False)
     assert draws["free"] / n == pytest.approx(persistent, abs=4 * np.sqrt(persistent * (1 - persistent) / n))

@@ -19,6 +19,7 @@ import psutil
 import pytest
 from arena import arena, visit, wall
 
+from mrtamp.baselines.composed_prm import ComposedOptions
 from mrtamp.check import check_plan
 from mrtamp.cli import main
 from mrtamp.cluster import Outcome, Told, pool
@@ -232,6 +233,15 @@ def test_seeds_are_different(seeds: list[int], tmp_path: Path) -> None:
         SeedPortfolio(detour(tmp_path), seeds)
 
 
+def test_settings_are_those_of_the_planner_and_refused_before_any_worker_starts(tmp_path: Path) -> None:
+    problem = detour(tmp_path)
+    portfolio = SeedPortfolio(problem, [0], planner="composed-prm", options={"batch": 7})
+    assert portfolio.options == ComposedOptions(batch=7)
+    assert SeedPortfolio(problem, [0]).options == Options()
+    with pytest.raises(MrtampError, match="composed-prm has no initial_vertices; choose from batch"):
+        SeedPortfolio(problem, [0], planner="composed-prm", options=QUICK)
+
+
 # On the command line.
 
 
@@ -239,7 +249,7 @@ def test_seeds_are_different(seeds: list[int], tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["--scheduler", "tcp://127.0.0.1:8786"], "found --scheduler without --portfolio N"),
-        (["--portfolio", "0"], "argument --portfolio: found '0', expected a whole number from 1"),
+        (["--portfolio", "0"], "--portfolio: found '0', expected a whole number from 1"),
         (["--portfolio", "1", "--scheduler", "nowhere"], "--scheduler: 'nowhere' .*expected the address of a running"),
     ],
 )

@@ -42,15 +42,7 @@ def refined(planner: Planner, plan: Plan) -> Refiner:
 
 
 def refiner(planner: Planner, plan: Plan, seed: int = 0) -> Refiner:
-    return Refiner(
-        plan.segments,
-        plan.transitions,
-        planner.problem.cost,
-        planner.collision,
-        planner.validity,
-        planner.roadmaps,
-        np.random.default_rng(seed),
-    )
+    return Refiner.of_plan(plan, planner.validity, np.random.default_rng(seed))
 
 
 def test_a_fresh_refiner_has_the_motion_and_the_cost_of_its_plan(planner: Planner, plan: Plan) -> None:

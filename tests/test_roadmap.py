@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import networkx as nx
 import numpy as np
 import pytest
+from arena import arena
 
-from mrtamp.collision import RESOLUTION, Counts, RobotWorld
-from mrtamp.problem import Problem, Robot
-from mrtamp.roadmap import Roadmap, lazy_path, prm_star_neighbours
+from mrtamp.collision import RESOLUTION, Collision, Counts, RobotWorld
+from mrtamp.problem import MovableObject, Problem, Robot, Shape, StaticBody
+from mrtamp.roadmap import Roadmap, add_stations, lazy_path, prm_star_neighbours, roadmaps_of
 from mrtamp.robot_file import load_robot_model
 from mrtamp.scene import RigidTransform
 
@@ -203,3 +206,34 @@ def test_unconnected_vertices_are_reached_through_their_exits_only(roadmap: Road
     blocked = np.zeros(roadmap.n_edges, dtype=bool)
     assert roadmap.shortest(0, v, blocked) == [0, exit_, v], "the direct edge to the exit is offered"
     assert roadmap.neighbours(v) == [exit_]
+
+
+@pytest.mark.parametrize("size", [0.04, 0.6], ids=["small", "large"])
+def test_edges_are_sampled_for_the_largest_object_that_may_be_carried(size: float) -> None:
+    """Turning the hand moves the far end of a long object further than anything of the arm."""
+    panda = load_robot_model("panda")
+    home = np.array(panda.home)
+    table = StaticBody("table", RigidTransform([0, 0, -1.05]), Shape("box", (1, 1, 0.1)))
+    bar = MovableObject("bar", "table", RigidTransform([0, 0, 0.1]), shape=Shape("box", (size, 0.02, 0.1)))
+    problem = Problem("one", (Robot("arm", panda, RigidTransform(), home, home),), (table,), (), (bar,), ())
+    collision = Collision(problem)
+    roadmap = roadmaps_of(problem, collision)["arm"]
+    turn = 0.5 * np.eye(7)[6]
+    n = roadmap.samples_between(home, home + turn)
+    reach = max(0.1, collision.worlds["arm"].object_radius["bar"])
+    assert reach >= size / 2
+    assert (n - 1) * RESOLUTION >= 0.99 * reach * 0.5, "an arc of half a radian"
+
+
+def test_what_a_problem_names_is_on_the_roadmaps_once(tmp_path: Path) -> None:
+    """The start first, then a home and an end that are elsewhere."""
+    problem = arena(tmp_path, {"a": (-1, 0), "b": (1, 0), "c": (0, 2)}, {"a": (1, 1), "b": (1, 0)})
+    a, *others = problem.robots
+    problem = replace(problem, robots=(replace(a, home=np.array([-1.0, 0.5])), *others))
+    roadmaps = roadmaps_of(problem, Collision(problem))
+    stations = add_stations(problem, roadmaps)
+    assert stations.start == {"a": 0, "b": 0, "c": 0}
+    assert stations.home == {"a": 1, "b": 0, "c": 0}
+    assert stations.goal == {"a": 2, "b": 0}
+    np.testing.assert_array_equal(roadmaps["a"].q, [(-1, 0), (-1, 0.5), (1, 1)])
+    assert [roadmaps[r].n_vertices for r in ("b", "c")] == [1, 1]

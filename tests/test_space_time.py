@@ -129,6 +129,33 @@ def test_schedules_of_random_legs_are_free_of_collisions(tmp_path: Path, seed: i
         assert length == pytest.approx(alone[robot]), "waiting costs time, not path"
 
 
+def test_who_is_scheduled_alone_goes_through_others_and_others_still_wait(tmp_path: Path) -> None:
+    """Schedules of both kinds share what is known of moves, and it stays true for both."""
+    t = Timing(tmp_path, {"a": (-1, 0), "b": (0, -1)})
+    q = {r: t.clearances.tables[r][0] for r in t.time.names}
+    makespans = []
+    for alone in (False, True, False):
+        t.time = SpaceTime(t.clearances, q, [t.mode], alone=alone)
+        assert t.go("a", (1, 0))
+        t.time = t.time.copy()
+        assert t.go("b", (0, 1))
+        assert t.judged() != alone
+        makespans.append(t.makespan())
+    assert makespans[1] == pytest.approx(2.0)
+    assert makespans[0] == makespans[2] > 2.0
+
+
+def test_who_is_scheduled_alone_stands_and_acts_inside_others(tmp_path: Path) -> None:
+    t = Timing(tmp_path, {"a": (-1, 0), "b": (0, 0)})
+    q = {r: t.clearances.tables[r][0] for r in t.time.names}
+    for alone in (False, True):
+        t.time = SpaceTime(t.clearances, q, [t.mode, t.mode], alone=alone)
+        leg = t.leg("a", (0.1, 0))
+        assert t.time.in_the_way(leg) == ([] if alone else ["b"])
+        assert t.time.insert(leg, certain=True), "scheduled even where it is not free"
+        assert t.time.happen(("a",)) == alone
+
+
 def test_copies_are_independent(tmp_path: Path) -> None:
     t = Timing(tmp_path, {"a": (-1, 0), "b": (0, -1)})
     assert t.go("a", (1, 0))

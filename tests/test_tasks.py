@@ -153,7 +153,7 @@ def test_every_size_loads(size: tuple[int, int]) -> None:
     assert len(problem.supports) == 2 * objects
 
 
-@pytest.mark.parametrize("arguments", [(0, 1), (9, 1), (1, 0), (1, 25), (1, 1, -1), (2.0, 1), ("2", 1)])
+@pytest.mark.parametrize("arguments", [(0, 1), (9, 1), (1, 0), (1, 25), (1, 1, -1), (2.0, 1), ("2", 1), (True, 1)])
 def test_sizes_out_of_range_are_refused(arguments: tuple[int, ...]) -> None:
     with pytest.raises(ProblemError, match="expected a whole number from"):
         pick_place(*arguments)

@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mrtamp.check import check_plan
     from mrtamp.plan import Plan
-    from mrtamp.planner import Options, Planner, Status
+    from mrtamp.planner import Options, Planner
     from mrtamp.planners import PLANNERS, make_planner
     from mrtamp.problem import MrtampError, Problem, ProblemError
     from mrtamp.problem_file import list_problems, load_problem
+    from mrtamp.status import Status
     from mrtamp.view import inline, view, write_html
 
     __version__: str
@@ -35,7 +36,7 @@ _HOMES = {
     "Planner": "planner",
     "Problem": "problem",
     "ProblemError": "problem",
-    "Status": "planner",
+    "Status": "status",
     "check_plan": "check",
     "inline": "view",
     "list_problems": "problem_file",

@@ -14,13 +14,20 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from mrtamp.arguments import Parser, count, natural, seconds
 from mrtamp.bench.arguments import add_bench, parse
-from mrtamp.mechanisms import BASELINE_MECHANISMS, INTRA_ORBIT_NAMES, MECHANISMS, PLANNER_NAMES
+from mrtamp.mechanisms import (
+    BASELINE_MECHANISMS,
+    INTRA_ORBIT_NAMES,
+    INTRA_ORBIT_PLANNERS,
+    MECHANISMS,
+    PLANNER_NAMES,
+)
 
 if TYPE_CHECKING:
     from mrtamp.plan import Plan
@@ -38,7 +45,12 @@ class _BadInput(Exception):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    options = _parser().parse_args(arguments)
+    options, left_over = _parser().parse_known_args(arguments)
+    if left_over:
+        text = " ".join(left_over)
+        if options.run is _bench:
+            options.parser.error(f"found {text} before SUITE, expected SUITE first")
+        options.parser.error(f"found {text}, which is no argument")
     try:
         code = _run(options)
         sys.stdout.flush()
@@ -93,6 +105,9 @@ def _plan(options: argparse.Namespace) -> int:
 
     if options.scheduler is not None and options.portfolio is None:
         raise _BadInput("found --scheduler without --portfolio N, expected both: one seed is planned here")
+    if options.intra_orbit is not None and options.planner not in INTRA_ORBIT_PLANNERS:
+        either = " or ".join(INTRA_ORBIT_PLANNERS)
+        raise _BadInput(f"--intra-orbit: {options.planner} has no such setting, expected it with {either} only")
     if options.out and options.html and options.out.resolve() == options.html.resolve():
         raise _BadInput(f"--out and --html are the same file, {options.out}")
     for path in (options.out, options.html):
@@ -275,7 +290,7 @@ def _serve(what: Plan | Problem, options: argparse.Namespace) -> None:
 
 def _bench(options: argparse.Namespace) -> int:
     """One kind of measurement; `chosen.measure` takes it and prints it."""
-    chosen = parse(options.what, options.arguments, _positive)
+    chosen = parse(options.what, options.arguments)
     from mrtamp.bench.table import Line
 
     files = chosen.files
@@ -324,6 +339,8 @@ def _ensure_writable(path: Path | None) -> None:
         if path.exists():
             with path.open("ab"):
                 pass
+    except FileExistsError as error:
+        raise _BadInput(f"cannot write {path}: {error.filename} is no folder") from None
     except OSError as error:
         raise _BadInput(f"cannot write {path}: {error.strerror}") from None
 
@@ -356,25 +373,6 @@ def _stop_on_signals() -> Iterator[list[int]]:
 # -- arguments ------------------------------------------------------------------------------------------------------
 
 
-def _positive(kind: Callable[[str], float], meaning: str) -> Callable[[str], float]:
-    def convert(text: str) -> float:
-        try:
-            value = kind(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"found {text!r}, expected {meaning}") from None
-        if not 0 < value < float("inf"):
-            raise argparse.ArgumentTypeError(f"found {text!r}, expected {meaning}")
-        return value
-
-    return convert
-
-
-def _natural(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number from 0")
-    return int(text)
-
-
 class _Version(argparse.Action):
     """Prints the version; a class of its own because finding it out takes longer than everything else."""
 
@@ -386,14 +384,13 @@ class _Version(argparse.Action):
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="mrtamp",
         description="Plan what several robot arms do together: who handles what, when, and every motion.",
         epilog="Exit codes: 0 found and checked, 1 no plan, a failed check or a missed aim, 2 bad input.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    count = _positive(int, "a whole number from 1")
 
     def problem_arguments(command: argparse.ArgumentParser) -> None:
         command.add_argument(
@@ -401,9 +398,7 @@ def _parser() -> argparse.ArgumentParser:
         )
         command.add_argument("--robots", type=count, metavar="N", help="number of robots (generated problems)")
         command.add_argument("--objects", type=count, metavar="N", help="number of objects (generated problems)")
-        command.add_argument(
-            "--layout-seed", type=_natural, metavar="N", help="seed of the layout (generated problems)"
-        )
+        command.add_argument("--layout-seed", type=natural, metavar="N", help="seed of the layout (generated problems)")
 
     listing = commands.add_parser("list", help="list the shipped problems")
     listing.add_argument("--json", action="store_true", help="print one JSON object")
@@ -417,7 +412,7 @@ def _parser() -> argparse.ArgumentParser:
         choices=PLANNER_NAMES,
         help=f"which planner (default {PLANNER_NAMES[0]}); the others are baselines to compare with",
     )
-    plan.add_argument("--seed", type=_natural, default=0, metavar="N", help="seed of the planner (default 0)")
+    plan.add_argument("--seed", type=natural, default=0, metavar="N", help="seed of the planner (default 0)")
     plan.add_argument(
         "--portfolio",
         type=count,
@@ -427,7 +422,6 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument(
         "--scheduler", metavar="ADDRESS", help="where: a Dask scheduler, tcp://host:port (default: N processes here)"
     )
-    seconds = _positive(float, "a positive number of seconds")
     plan.add_argument("--budget", type=seconds, metavar="S", help=f"seconds of planning (default {DEFAULT_BUDGET_S:g})")
     plan.add_argument("--iterations", type=count, metavar="N", help="stop after N iterations; repeatable for a seed")
     plan.add_argument("--first", action="store_true", help="stop at the first plan")
@@ -470,6 +464,8 @@ def _parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help="measure planners: suites of runs, their reports and comparisons")
     bench.set_defaults(run=_bench)
     add_bench(bench)
+    for command in commands.choices.values():
+        command.set_defaults(parser=command)
     return parser
 
 

@@ -42,6 +42,10 @@ class Counts:
         """The counts by name."""
         return dict(vars(self))
 
+    def work(self) -> dict[str, int]:
+        """The counts by name as every planner reports them: `ik_calls` are seeds from which IK was solved."""
+        return {**self.as_dict(), "ik_calls": self.ik_attempts}
+
 
 def slot_keys(problem: Problem) -> dict[str, str]:
     """Objects with the same key share one slot: their collision geometry and their collision rules are the same."""

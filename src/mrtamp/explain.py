@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from mrtamp.status import Reporting
 from mrtamp.transitions.candidate import Outcome, StratumKey
-
-if TYPE_CHECKING:
-    from mrtamp.baselines.anytime import Anytime
-    from mrtamp.planner import Planner
 
 _MANY = 12
 
 
-def explain(planner: Planner | Anytime) -> str:
+def explain(planner: Reporting) -> str:
     """A few lines for a person: the nearest mode, the strata that never gave a transition, the motions that failed."""
     lines = []
     modes = list(planner.modes())
@@ -45,7 +40,7 @@ def explain(planner: Planner | Anytime) -> str:
     return "\n".join(lines)
 
 
-def _object_lines(planner: Planner | Anytime, item: str) -> list[str]:
+def _object_lines(planner: Reporting, item: str) -> list[str]:
     tried = [(key, o) for key, o in planner.sampler.outcomes.items() if key[2] == item and o.calls]
     failed = [(key, o) for key, o in tried if not o.accepted]
     goals = set(planner.guidance.goal_places(item))

@@ -19,8 +19,8 @@ from mrtamp.intra_orbit.orbits import Orbits
 from mrtamp.intra_orbit.planners import INTRA_ORBIT
 from mrtamp.modes import Mode, goal_mode
 from mrtamp.plan import Segment, Transition, without_detours
-from mrtamp.problem import MrtampError, Problem, RobotAt
-from mrtamp.roadmap import Roadmap
+from mrtamp.problem import MrtampError, Problem
+from mrtamp.roadmap import Roadmap, add_stations
 from mrtamp.steering import Steering
 from mrtamp.tensor_tree import At, Node, TensorTree
 from mrtamp.transitions.candidate import Candidate
@@ -74,17 +74,9 @@ class Growth:
 
     def start(self, mode: Mode) -> Node:
         """The root: every robot at its start; final configurations become vertices too."""
-        at = []
-        for robot in self.problem.robots:
-            roadmap = self.roadmaps[robot.name]
-            at.append(roadmap.add_vertex(robot.start))
-            if np.max(np.abs(robot.home - robot.start)) > 0:
-                roadmap.add_vertex(robot.home)
-            for condition in self.problem.goal:
-                if isinstance(condition, RobotAt) and condition.robot == robot.name:
-                    known = roadmap.find(condition.q)
-                    self.goal_vertices[robot.name] = roadmap.add_vertex(condition.q) if known is None else known
-        root = self.tree.add_root(mode, tuple(at), self.graphs.add_orbit(mode))
+        stations = add_stations(self.problem, self.roadmaps)
+        self.goal_vertices = stations.goal
+        root = self.tree.add_root(mode, tuple(stations.start.values()), self.graphs.add_orbit(mode))
         self.note_goal(root)
         return root
 

@@ -1,7 +1,8 @@
 """Realising a skeleton in space and time: one robot's motion after the other is inserted among those already timed.
 
-Every leg is the shortest roadmap path of its robot past static and resting things; the timing, and if need be the
-other robots' stepping aside, keeps robots apart.  Idle and finished robots may always move (DESIGN section 9).
+Stops whose transitions stand on roadmap vertices go in; timed segments and transitions come out.  Every leg is the
+shortest roadmap path of its robot past static and resting things; the timing, and if need be the other robots' stepping
+aside, keeps robots apart.  Idle and finished robots may always move (DESIGN section 9).
 """
 
 from __future__ import annotations
@@ -16,20 +17,20 @@ from mrtamp.collision import Collision
 from mrtamp.modes import Mode
 from mrtamp.plan import Segment, Transition
 from mrtamp.roadmap import Roadmap
-from mrtamp.space_time import STEP, Clearances, Leg, SpaceTime
+from mrtamp.roadmap_rows import RoadmapRows
+from mrtamp.space_time import STEP, Leg, SpaceTime
 from mrtamp.steering import Steering
 from mrtamp.transitions.candidate import Candidate
 from mrtamp.validity import Validity
 
 _DEPTH = 2
 """How many robots may have to move for one another in a chain."""
-_TABLES = 60_000
-"""Cached answers after which the tables are emptied."""
 _AROUND = 12
 """Lazy searches for a way past standing robots."""
 _ASIDE = 6
 """Random vertices offered to a robot that is in the way."""
-
+_ORDERS = 6
+"""Orders that are tried in which robots go to their goals in the end."""
 
 Stand = Callable[[int, Mode], Candidate | None]
 """Number of a stop, mode -> its transition there; None while something is in its way."""
@@ -50,10 +51,10 @@ class _State:
 
 
 class Insertion:
-    """Builds timed plans for skeletons whose stops stand on roadmap vertices.
+    """Builds timed plans for skeletons.
 
     Each robot's stops keep their order; among robots, the stop that can happen soonest happens next, and only where
-    none can, robots step aside for one another.
+    none can, robots step aside for one another.  What attempts learn about moves is kept for later ones.
 
     Attributes
     ----------
@@ -74,16 +75,10 @@ class Insertion:
         self.steering = steering
         self.rng = rng
         self.stuck: int | None = None
-        self._collision = collision
-        self._forget()
+        self._rows = RoadmapRows(roadmaps, collision, validity)
+        # Of one attempt: the transitions at its stops as far as they were asked for, and its `variety`.
         self._known: dict[tuple[int, Mode], Candidate | None] = {}
         self._variety = 0.0
-
-    def _forget(self) -> None:
-        """Start with empty tables: what they hold is soon of no use, and there is always more."""
-        self._clearances = Clearances(self._collision, self.validity, self.names)
-        self._rows: dict[tuple[str, int], int] = {}
-        self._edges: dict[tuple[str, int, int], list[int]] = {}
 
     def realise(
         self,
@@ -101,6 +96,7 @@ class Insertion:
 
         Parameters
         ----------
+        root : the mode in the beginning.
         start, goal : robot -> vertex; robots without a goal end anywhere.
         robots : who takes part in every stop, in an order of stops that is possible for every robot.
         before : numbers of the stops that have to happen earlier than each.
@@ -112,11 +108,9 @@ class Insertion:
         self.stuck = None
         self._variety = variety
         self._known.clear()
-        if self._clearances.size > _TABLES:
-            self._forget()
-        self._clearances.alone = alone
+        self._rows.forget_if_full()
         q = {r: self.roadmaps[r].q[v] for r, v in start.items()}
-        time = SpaceTime(self._clearances, q, [root])
+        time = SpaceTime(self._rows.clearances, q, [root], alone=alone)
         state = _State(time, dict(start), root, tuple(range(len(robots))))
         while state.pending:
             ready = self._ready(state, robots, before)
@@ -210,7 +204,8 @@ class Insertion:
         return trial
 
     def _go_home(self, state: _State, goal: Mapping[str, int]) -> _State | None:
-        for order in itertools.islice(itertools.permutations(goal), 6):
+        """The schedule in which all robots end at their goals, or None; the first order that works is taken."""
+        for order in itertools.islice(itertools.permutations(goal), _ORDERS):
             trial: _State | None = state
             for robot in order:
                 trial = self._bring(trial, robot, goal[robot], goal, _DEPTH) if trial is not None else None
@@ -271,11 +266,11 @@ class Insertion:
     def _clears(self, state: _State, robot: str, v: int, leg: Leg) -> bool:
         """Whether a robot that stands at v leaves the leg of another free."""
         trial = state.time.copy()
-        trial.at[robot] = self._row(robot, v)
+        trial.at[robot] = self._rows.vertex(robot, v)
         return robot not in trial.in_the_way(leg)
 
     def _leg(self, state: _State, robot: str, v: int, around: frozenset[str] = frozenset()) -> Leg | None:
-        """The shortest way past the static world and the robots `around`, as far as those are known to stay."""
+        """The shortest way past the world, objects as they lie, and the robots `around` where they stand; or None."""
         at = tuple(state.at[r] for r in self.names)
         others = {r for r in self.names if r != robot} - around
         if around:
@@ -285,22 +280,4 @@ class Insertion:
             path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, detour=detour)
         if path is None:
             return None
-        rows = [state.time.at[robot]]
-        for a, b in itertools.pairwise(path):
-            rows += self._edge(robot, a, b)
-        self._clearances.prepare(robot, [*itertools.pairwise(rows), *zip(rows, rows, strict=True)])
-        return Leg({robot: rows}, state.mode)
-
-    def _row(self, robot: str, v: int) -> int:
-        if (robot, v) not in self._rows:
-            self._rows[robot, v] = self._clearances.row(robot, self.roadmaps[robot].q[v].copy())
-        return self._rows[robot, v]
-
-    def _edge(self, robot: str, a: int, b: int) -> list[int]:
-        """Rows along an edge from a to b, the first end excluded."""
-        if (robot, a, b) not in self._edges:
-            q = self.roadmaps[robot].q
-            n = max(1, int(np.ceil(np.linalg.norm(q[b] - q[a]) / STEP)))
-            inner = [self._clearances.row(robot, q[a] + (q[b] - q[a]) * (j / n)) for j in range(1, n)]
-            self._edges[robot, a, b] = [*inner, self._row(robot, b)]
-        return self._edges[robot, a, b]
+        return Leg({robot: self._rows.path(robot, path, state.time.at[robot])}, state.mode)

@@ -20,13 +20,18 @@ from mrtamp.tasks import (
     CUBE,
     EDGE_CLEARANCE,
     SPACING,
-    WOOD,
+    Size,
     color,
-    ensure_whole,
+    cubes,
+    generated,
+    panda_arms,
     pick_place_dict,
     pose,
+    problem_name,
     reachable,
     ring,
+    table,
+    table_around,
     table_half_size,
 )
 
@@ -70,20 +75,15 @@ def clutter(robots: int = 2, objects: int = 4, layout_seed: int = 0) -> Problem:
 
     Parameters
     ----------
-    robots, objects
-        How many: 2 to 4 and 1 to 6.
-    layout_seed
-        Chooses the layout: that of `pick_place` for the same seed, and the boxes.
+    robots, objects : how many, 2 to 4 and 1 to 6.
+    layout_seed : chooses the layout, that of `pick_place` for the same seed, and the boxes.
 
     Raises
     ------
-    ProblemError
-        A parameter is out of range.
+    ProblemError : a parameter is out of range.
     """
-    ensure_whole("clutter", "robots", robots, *CLUTTERED_ROBOTS)
-    ensure_whole("clutter", "objects", objects, *CLUTTERED_OBJECTS)
-    ensure_whole("clutter", "layout_seed", layout_seed, 0)
-    return _problem(clutter_dict(robots, objects, layout_seed))
+    sizes = {"robots": Size(robots, *CLUTTERED_ROBOTS), "objects": Size(objects, *CLUTTERED_OBJECTS)}
+    return generated("clutter", clutter_dict, layout_seed, **sizes)
 
 
 def box_layout(layout_seed: int = 0) -> Problem:
@@ -91,11 +91,9 @@ def box_layout(layout_seed: int = 0) -> Problem:
 
     Raises
     ------
-    ProblemError
-        The layout seed is no whole number from 0.
+    ProblemError : the layout seed is no whole number from 0.
     """
-    ensure_whole("box_layout", "layout_seed", layout_seed, 0)
-    return _problem(box_layout_dict(layout_seed))
+    return generated("box_layout", box_layout_dict, layout_seed)
 
 
 def handover_layout(objects: int = 2, layout_seed: int = 0) -> Problem:
@@ -103,19 +101,14 @@ def handover_layout(objects: int = 2, layout_seed: int = 0) -> Problem:
 
     Parameters
     ----------
-    objects
-        How many bars, 1 to 4; from two on they go both ways.
-    layout_seed
-        Chooses the layout.
+    objects : how many bars, 1 to 4; from two on they go both ways.
+    layout_seed : chooses the layout.
 
     Raises
     ------
-    ProblemError
-        A parameter is out of range.
+    ProblemError : a parameter is out of range.
     """
-    ensure_whole("handover_layout", "objects", objects, 1, MOST_BARS)
-    ensure_whole("handover_layout", "layout_seed", layout_seed, 0)
-    return _problem(handover_layout_dict(objects, layout_seed))
+    return generated("handover_layout", handover_layout_dict, layout_seed, objects=Size(objects, 1, MOST_BARS))
 
 
 def stacking_layout(robots: int = 2, objects: int = 4, layout_seed: int = 0) -> Problem:
@@ -123,26 +116,15 @@ def stacking_layout(robots: int = 2, objects: int = 4, layout_seed: int = 0) -> 
 
     Parameters
     ----------
-    robots, objects
-        How many: 2 or 3, and 2 to 6.
-    layout_seed
-        Chooses the layout.
+    robots, objects : how many, 2 or 3, and 2 to 6.
+    layout_seed : chooses the layout.
 
     Raises
     ------
-    ProblemError
-        A parameter is out of range.
+    ProblemError : a parameter is out of range.
     """
-    ensure_whole("stacking_layout", "robots", robots, *STACKING_ROBOTS)
-    ensure_whole("stacking_layout", "objects", objects, *STACKED_CUBES)
-    ensure_whole("stacking_layout", "layout_seed", layout_seed, 0)
-    return _problem(stacking_layout_dict(robots, objects, layout_seed))
-
-
-def _problem(data: dict[str, Any]) -> Problem:
-    from mrtamp.problem_file import problem_from_dict  # here, because problem_file lists the generators
-
-    return problem_from_dict(data)
+    sizes = {"robots": Size(robots, *STACKING_ROBOTS), "objects": Size(objects, *STACKED_CUBES)}
+    return generated("stacking_layout", stacking_layout_dict, layout_seed, **sizes)
 
 
 # -- the problems as the content of problem files ---------------------------------------------------------------------
@@ -183,7 +165,7 @@ def clutter_dict(robots: int, objects: int, layout_seed: int = 0) -> dict[str, A
         ]
 
     data["world"] += _first(draw, "clutter", layout_seed, robots, objects)
-    data["name"] = _name("clutter", layout_seed, robots, objects)
+    data["name"] = problem_name("clutter", layout_seed, robots, objects)
     data["description"] = (
         f"Pick and place in clutter: {robots} robots, {objects} cubes, {_OBSTACLES_PER_ROBOT * robots} obstacles, "
         f"layout {layout_seed}."
@@ -217,11 +199,11 @@ def box_layout_dict(layout_seed: int = 0) -> dict[str, Any]:
     order = rng.permutation([-1.0, 1.0])
     return {
         "mrtamp": 1,
-        "name": _name("box_layout", layout_seed),
+        "name": problem_name("box_layout", layout_seed),
         "description": f"Two Pandas take two cubes out of a box that admits one gripper, layout {layout_seed}.",
-        "robots": _robots(bases, ("left", "right")),
+        "robots": panda_arms(bases, ("left", "right")),
         "world": [
-            _table("table", [1.6, 1.4], [0.0, 0.0]),
+            table("table", [1.6, 1.4]),
             wall("box_floor", 0, 0, [_BOX_WIDTH, _BOX_LENGTH, _WALL]),
             wall("box_wall_left", -across, 0, [_WALL, _BOX_LENGTH + 2 * _WALL, _BOX_HEIGHT]),
             wall("box_wall_right", across, 0, [_WALL, _BOX_LENGTH + 2 * _WALL, _BOX_HEIGHT]),
@@ -277,12 +259,10 @@ def handover_layout_dict(objects: int, layout_seed: int = 0) -> dict[str, Any]:
     height = _BAR[2] / 2
     return {
         "mrtamp": 1,
-        "name": _name("handover_layout", layout_seed, objects),
+        "name": problem_name("handover_layout", layout_seed, objects),
         "description": f"Two Pandas at separate tables hand over {objects} bars, layout {layout_seed}.",
-        "robots": _robots(bases, names),
-        "world": [
-            _table(name, list(_TABLE_SIZE), [x, 0.0]) for name, x in zip(tables, (-_TABLE_X, _TABLE_X), strict=True)
-        ],
+        "robots": panda_arms(bases, names),
+        "world": [table(name, _TABLE_SIZE, x) for name, x in zip(tables, (-_TABLE_X, _TABLE_X), strict=True)],
         "objects": [
             {
                 "name": f"bar{i + 1}",
@@ -321,23 +301,15 @@ def stacking_layout_dict(robots: int, objects: int, layout_seed: int = 0) -> dic
         return tower, np.array(starts), rng.permutation(objects), rng.uniform(-90, 90, size=objects + 1)
 
     tower, starts, order, yaws = _first(draw, "stacking_layout", layout_seed, robots, objects)
-    names = [f"cube{i + 1}" for i in range(objects)]
-    side = round(2 * table_half_size(bases), 3)
+    things = cubes(starts, yaws[:-1])
+    names = [thing["name"] for thing in things]
     return {
         "mrtamp": 1,
-        "name": _name("stacking_layout", layout_seed, robots, objects),
+        "name": problem_name("stacking_layout", layout_seed, robots, objects),
         "description": f"{robots} robots build one tower of {objects} cubes, layout {layout_seed}.",
-        "robots": _robots(bases, [f"arm{i + 1}" for i in range(robots)]),
-        "world": [_table("table", [side, side], [0.0, 0.0])],
-        "objects": [
-            {
-                "name": name,
-                "shape": {"box": [CUBE] * 3},
-                "color": color(i, objects),
-                "start": {"on": "table", "X_WO": pose(starts[i], CUBE / 2, yaws[i])},
-            }
-            for i, name in enumerate(names)
-        ],
+        "robots": panda_arms(bases, [f"arm{i + 1}" for i in range(robots)]),
+        "world": [table_around(bases)],
+        "objects": things,
         "goal": [
             {"object": names[order[0]], "at": pose(tower, CUBE / 2, yaws[-1]), "on": "table"},
             *({"object": names[upper], "on": names[lower]} for lower, upper in itertools.pairwise(order)),
@@ -346,23 +318,6 @@ def stacking_layout_dict(robots: int, objects: int, layout_seed: int = 0) -> dic
 
 
 # -- parts ------------------------------------------------------------------------------------------------------------
-
-
-def _robots(bases: np.ndarray, names: Any) -> list[dict[str, Any]]:
-    return [
-        {"name": name, "model": "panda", "X_WB": pose(base[:2], 0.0, base[2])}
-        for name, base in zip(names, bases, strict=True)
-    ]
-
-
-def _table(name: str, size: list[float], middle: list[float]) -> dict[str, Any]:
-    X_WB = {"translation": [*middle, -0.05]}
-    return {"name": name, "shape": {"box": [*size, 0.1]}, "X_WB": X_WB, "color": WOOD}
-
-
-def _name(task: str, layout_seed: int, *sizes: int) -> str:
-    """As `pick_place` names its problems: the first layout is the one without a seed in its name."""
-    return "_".join([task, *map(str, sizes), *([f"seed{layout_seed}"] if layout_seed else [])])
 
 
 def _first(draw: Callable[[np.random.Generator], Any], task: str, *seeds: int) -> Any:

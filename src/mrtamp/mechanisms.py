@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 MECHANISMS = {
     "modal-guidance": "optimistic modal guidance before the first plan; without it orbits and transitions are random",
     "orbit-path-guidance": "after the first plan, half of the search works along the incumbent's orbits",
@@ -21,6 +23,9 @@ MECHANISMS = {
 INTRA_ORBIT_NAMES = ("tensor-tree", "prioritised")
 """Planners of motion inside an orbit; see `mrtamp.intra_orbit.planners`."""
 
+INTRA_ORBIT_PLANNERS = ("guided", "unguided")
+"""Planners that have a choice of them."""
+
 PLANNER_NAMES = ("guided", "unguided", "composed-prm", "prioritised")
 """Planners that can be asked for by name; see `mrtamp.planners`."""
 
@@ -31,3 +36,27 @@ BASELINE_MECHANISMS = {
     "factored-cache": MECHANISMS["factored-cache"],
 }
 """The same for the baselines, as far as they have them."""
+
+MECHANISMS_OF = {
+    "guided": tuple(MECHANISMS),
+    "unguided": tuple(MECHANISMS),
+    "composed-prm": tuple(BASELINE_MECHANISMS),
+    "prioritised": ("refinement", "factored-cache"),
+}
+"""Planner -> the mechanisms that can be switched off in it."""
+
+
+def check_without(planner: str, without: Iterable[str]) -> None:
+    """Refuse names of mechanisms that a planner does not have.
+
+    Raises
+    ------
+    MrtampError : naming the planner, what it does not have and what there is.
+    """
+    # Takes long, and the command line knows the names before it needs anything else.
+    from mrtamp.problem import MrtampError
+
+    known = MECHANISMS_OF[planner]
+    unknown = sorted(set(without) - set(known))
+    if unknown:
+        raise MrtampError(f"without: {planner} has no {', '.join(unknown)}; choose from {', '.join(known)}")

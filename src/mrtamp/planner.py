@@ -1,6 +1,7 @@
 """The anytime loop: modal- and orbit-guided asymptotically optimal MR-TAMP (paper, algorithm 1).
 
-Read `Planner.improve` beside the algorithm; each named step is a method below it, and the geometry lives elsewhere.
+Read `Planner.improve` and `Planner._search` beside the algorithm.  Its steps have their names here, in `orbit_guidance`
+(where to work), in `orbit_sampling` (what to sample) and in `growth` (the tree); the geometry lives elsewhere.
 """
 
 from __future__ import annotations
@@ -16,61 +17,33 @@ from mrtamp.collision import Collision, Counts
 from mrtamp.coordination import coordinate
 from mrtamp.effort import Effort
 from mrtamp.explain import explain
-from mrtamp.growth import Growth, Timed
+from mrtamp.growth import Combination, Growth
 from mrtamp.guidance import Choice, ModalGuidance
 from mrtamp.incumbent import Incumbent
 from mrtamp.intra_orbit.planners import INTRA_ORBIT
-from mrtamp.mechanisms import MECHANISMS
+from mrtamp.mechanisms import check_without
 from mrtamp.modes import Mode, start_mode
-from mrtamp.plan import Plan, Transition, plan_cost
+from mrtamp.orbit_guidance import OrbitGuidance
+from mrtamp.orbit_sampling import OrbitSampling
+from mrtamp.plan import Plan, Transition
 from mrtamp.portfolio import Portfolio
 from mrtamp.problem import MrtampError, Problem
-from mrtamp.roadmap import Roadmap
-from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
+from mrtamp.realisation import Realisation
+from mrtamp.roadmap import roadmaps_of
+from mrtamp.skeleton_guidance import SkeletonGuidance
+from mrtamp.status import Status, status_of
 from mrtamp.tensor_tree import Node
-from mrtamp.transitions.candidate import Candidate
-from mrtamp.transitions.choices import known_candidates, new_candidates
-from mrtamp.transitions.projection import uniform_configurations
 from mrtamp.transitions.sampler import TransitionSampler
 from mrtamp.validity import Validity
 
-_VISIT = 0.8
-"""How much farther a modal state seems for the square root of its visits."""
-_PATIENCE = 4
-"""Failures of a transition in a mode after which guidance no longer insists on promising candidates."""
-
-
 _SKELETON_TURN = 4
 """Before the first plan, every so many iterations skeletons have their turn."""
-_FIRST_WAYS, _MORE_WAYS = (80, 14), (64, 20)
-"""IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
-_REALISATIONS = 6
-"""Skeletons that are tried at a time."""
 _WORTH_ADOPTING = 0.01
 """Relative gain over what the tree has for which a refined plan is put into it."""
-_COVER = 3200
-"""Initial vertices of a robot with n joints: at least this over the square of n."""
-_GROWTH = 1.0
-"""Roadmaps grow by at least so many times the square root of their size per iteration: in proportion to their size they
-would grow exponentially, and less and less exploration would fit into a second."""
 _RAREST = 5
 """Binary logarithm of the longest pause, in iterations, between attempts at skeletons that lead to nothing new."""
 _REWIRINGS = 6
 """Steps that may be validated for rewiring per insertion, once there is a plan."""
-_QUICK, _THOROUGH = 30, 300
-"""Orders evaluated per search for skeletons, before there is a plan and later."""
-_RIVALS, _INSERTIONS = 2, 3
-"""Skeletons of which the cheapest is refined, and realisations of each that are compared."""
-_SKETCHED, _DRAFTS = 4, 3
-"""Skeletons that are drafted at a time, and drafts of them that are refined."""
-_POOR = 2.0
-"""A first realisation that costs so many times what its skeleton promised is not the only one."""
-_MANY = 12
-"""Stops from which on a realisation takes too long for that."""
-_HOPE = 1.0
-"""Skeletons are realised while their estimate is less than the incumbent's cost times this."""
-_TIE = 0.25
-"""Difference of optimistic estimates within which guidance chooses at random."""
 
 
 @dataclass(frozen=True)
@@ -99,23 +72,7 @@ class Options:
     def __post_init__(self) -> None:
         if self.intra_orbit not in INTRA_ORBIT:
             raise MrtampError(f"intra_orbit: {self.intra_orbit!r} is unknown; choose from {', '.join(INTRA_ORBIT)}")
-        unknown = sorted(self.without - set(MECHANISMS))
-        if unknown:
-            raise MrtampError(f"without: unknown mechanism {', '.join(unknown)}; choose from {', '.join(MECHANISMS)}")
-
-
-@dataclass(frozen=True)
-class Status:
-    """Where the planner stands, for people who wait."""
-
-    phase: str
-    iteration: int
-    elapsed_s: float
-    modes: int
-    orbits: int
-    nodes: int
-    remaining: int
-    cost: float | None
+        check_without("guided", self.without)
 
 
 class Planner:
@@ -141,8 +98,7 @@ class Planner:
         self.rng = np.random.default_rng(seed)
         self._counts = Counts()
         self.collision = Collision(problem, self._counts)
-        radius = max([0.1, *(r for w in self.collision.worlds.values() for r in w.object_radius.values())])
-        self.roadmaps = {r.name: Roadmap(self.collision.worlds[r.name], radius) for r in problem.robots}
+        self.roadmaps = roadmaps_of(problem, self.collision)
         self.names = list(self.roadmaps)
         self.validity = Validity(problem, self.collision, self.roadmaps, remember=self._uses("factored-cache"))
         for roadmap in self.roadmaps.values():
@@ -151,20 +107,35 @@ class Planner:
         self.growth = Growth(problem, self.roadmaps, self.validity, self.rng, self.options.intra_orbit)
         self.graphs, self.tree = self.growth.graphs, self.growth.tree
         self.guidance = ModalGuidance(problem, self.sampler, self.graphs)
+        self.orbit_guidance = OrbitGuidance(
+            self.graphs,
+            self.tree,
+            self.guidance,
+            self.rng,
+            persistent=self.options.persistent,
+            by_mode=self._uses("modal-guidance"),
+            along_path=self._uses("orbit-path-guidance"),
+        )
+        self.sampling = OrbitSampling(
+            self.roadmaps,
+            self.sampler,
+            self.orbit_guidance,
+            self.growth,
+            self.rng,
+            interior_samples=self.options.interior_samples,
+            transition_samples=self.options.transition_samples,
+            combinations=self.options.extensions,
+            persistent=self.options.persistent,
+        )
         self.iteration = 0
-        self._path: list[int] = []
         self._tree_cost = np.inf
         self._stale = self._skeletons_from = 0
-        self._drafting = False
         self.incumbent = Incumbent(problem, seed, self._counts)
         self.incumbent.check_start()
         mode = start_mode(problem)
         self.sampler.remember(mode)
         self.root = self.growth.start(mode)
-        for robot in problem.robots:
-            # A space of few dimensions is soon covered, and then paths in it are nearly shortest.
-            n = robot.start.size
-            self._add_interior(robot.name, max(self.options.initial_vertices, _COVER // n**2))
+        self.sampling.cover(self.options.initial_vertices)
         self.skeletons = SkeletonGuidance(problem, self.sampler, self.guidance, mode)
         self.portfolio = Portfolio(
             problem,
@@ -176,6 +147,15 @@ class Planner:
             self.rng,
             convex=self._uses("convex-programming"),
             sliding=self._uses("sliding"),
+        )
+        self.realisation = Realisation(
+            self.growth,
+            self.skeletons,
+            self.incumbent,
+            self.portfolio,
+            self.root,
+            self._to_beat,
+            drafts=self._uses("drafts"),
         )
         self._effort = Effort(
             {"search": 0.05, "skeletons": 0.08, "refinement": 0.1},
@@ -237,13 +217,19 @@ class Planner:
 
     def _search(self) -> bool:
         """One iteration of the algorithm's loop; whether there is a better plan."""
-        orbit, choices = self._guide()
-        self._expand_roadmaps()
-        candidates = self._sample_transitions(orbit, choices)
+        orbit, choices = self.orbit_guidance.choose(improving=self.best is not None)
+        self.sampling.expand_roadmaps()
+        mode = self.graphs.mode(orbit)
+        candidates = self.sampling.sample_transitions(mode, choices, improving=self.best is not None)
         for combination in candidates:
-            self._discover_adjacent_orbit(orbit, combination)
+            self._discover_adjacent_orbit(mode, combination)
         self._extend_tree(orbit, choices, candidates)
         return self._best_solution()
+
+    def _discover_adjacent_orbit(self, mode: Mode, combination: Combination) -> None:
+        """Note the modal state that a sampled transition leads to."""
+        after = mode.after(Transition(tuple(c.action for c in combination)))
+        self.graphs.discover(after.state, mode.state)
 
     def _next_activity(self) -> str:
         """Before the first plan search and skeletons in turn; then what is behind its share."""
@@ -281,150 +267,9 @@ class Planner:
         """Seconds spent planning, over all calls."""
         return time.perf_counter() - self._clock
 
-    # -- guidance -------------------------------------------------------------------------------------------------
-
-    def _guide(self) -> tuple[int, list[Choice]]:
-        """Orbit to work in and the elementary transitions Gamma to sample there (one per robot, disjoint)."""
-        explore = self.rng.random() < self.options.persistent
-        along = self.best is not None and self._uses("orbit-path-guidance") and self.rng.random() < 0.5
-        modal = self._uses("modal-guidance")
-        if explore or not (along or modal):
-            orbit = self._any_orbit()
-        elif along:
-            orbit = self._orbit_path_guidance()
-        else:
-            orbit = self._modal_frontier()
-        self.graphs.orbital.nodes[orbit]["visits"] += 1
-        mode = self.graphs.mode(orbit)
-        self.graphs.modal.nodes[mode.state]["visits"] += 1
-        if explore or not modal:
-            return orbit, self.guidance.feasible_sets(mode, self.rng)
-        return orbit, self._optimistic_choices(mode)
-
-    def _any_orbit(self) -> int:
-        """A living orbit, drawn uniformly from all or from those of a modal state that is drawn first.
-
-        Orbits grow in number for ever and so does, slowly, the count of draws of each; modal states are finitely many,
-        and so is what can be done in them: that keeps its share.
-        """
-        known = [[o for o in orbits if self.tree.of_orbit.get(o)] for orbits in self.graphs.orbits_of.values()]
-        known = [orbits for orbits in known if orbits]
-        if self.rng.random() < 0.5:
-            known = [[o for orbits in known for o in orbits]]
-        orbits = known[int(self.rng.integers(len(known)))]
-        return orbits[int(self.rng.integers(len(orbits)))]
-
-    def _modal_frontier(self) -> int:
-        """The orbit of the modal state that is optimistically nearest to the goal, visits held against it."""
-        best, chosen = np.inf, 0
-        for state, known in self.graphs.orbits_of.items():
-            orbits = [o for o in known if self.tree.of_orbit.get(o)]
-            if not orbits:
-                continue
-            visits = self.graphs.modal.nodes[state]["visits"]
-            orbit = min(orbits, key=lambda o: self.graphs.orbital.nodes[o]["visits"])
-            score = self.guidance.remaining(self.graphs.mode(orbit)) + _VISIT * np.sqrt(visits)
-            if score <= best:
-                best, chosen = score, orbit
-        return chosen
-
-    def _orbit_path_guidance(self) -> int:
-        """An orbit on the incumbent's path."""
-        path = [o for o in {self.graphs.find(o): None for o in self._path} if self.tree.of_orbit.get(o)]
-        return path[int(self.rng.integers(len(path)))] if path else self._modal_frontier()
-
-    def _optimistic_choices(self, mode: Mode) -> list[Choice]:
-        """A transition of those that are optimistically best."""
-        proposals = self.guidance.proposals(mode)
-        if not proposals:
-            return []
-        least = proposals[0][0]
-        ties = [c for score, c in proposals if score <= least + _TIE]
-        # Whoever acted longest ago acts next: alternating robots can move at the same time later on.
-        last = self._last_actions(mode)
-        oldest = min(max(last.get(r, -1) for r in c.robots) for c in ties)
-        ties = [c for c in ties if max(last.get(r, -1) for r in c.robots) == oldest]
-        return [ties[int(self.rng.integers(len(ties)))]]
-
-    def _last_actions(self, mode: Mode) -> dict[str, int]:
-        """When each robot last acted on the way to `mode`, counted in transitions."""
-        node = self.tree.entry(mode)
-        if node is None:
-            return {}
-        actions = [x.transition for x in self.tree.branch(node) if x.transition is not None]
-        return {r: i for i, t in enumerate(actions) for r in t.active}
-
-    def _still_best(self, mode: Mode, choice: Choice) -> bool:
-        proposals = self.guidance.proposals(mode)
-        return any(c == choice and score <= proposals[0][0] + _TIE for score, c in proposals)
-
-    # -- sampling -------------------------------------------------------------------------------------------------
-
-    def _expand_roadmaps(self) -> None:
-        """SampleOrbitInterior and ExpandRoadmaps: every constituent roadmap keeps growing."""
-        for name in self.names:
-            grown = int(_GROWTH * np.sqrt(self.roadmaps[name].n_vertices))
-            self._add_interior(name, max(self.options.interior_samples, grown))
-
-    def _add_interior(self, name: str, n: int) -> None:
-        """n samples; half uniform, half around known vertices, where passages matter most; free ones are kept."""
-        roadmap = self.roadmaps[name]
-        world = roadmap.world
-        q = uniform_configurations(world.tool, self.rng, n)
-        known = roadmap.q[self.rng.integers(roadmap.n_vertices, size=n)]
-        near = np.clip(known + self.rng.normal(scale=0.4, size=q.shape), world.chain.lower, world.chain.upper)
-        q = np.where(self.rng.random(n)[:, None] < 0.5, q, near)
-        for x in q[~world.hits(world.rows(q, None, {}))]:
-            roadmap.add_vertex(x)
-
-    def _sample_transitions(self, orbit: int, choices: list[Choice]) -> list[tuple[Candidate, ...]]:
-        """SampleTransitions: new candidates for every choice, combined into simultaneous transitions of A."""
-        mode = self.graphs.mode(orbit)
-        lists = []
-        for choice in choices:
-            failed = self.guidance.failed(mode, choice)
-            guided = len(choices) == 1 and failed < _PATIENCE
-            known = known_candidates(self.sampler, mode, choice)
-            if guided:
-                known = [c for c in known if c.promising and not (self.best is None and self.growth.taken(mode, c))]
-            # Grow the set while it is small, later in step with its logarithm, for ever.
-            if len(known) < 4 or self.best is not None or self.rng.random() < 0.3 + self.options.persistent:
-                known = [
-                    *(
-                        c
-                        for c in new_candidates(self.sampler, mode, choice, self.options.transition_samples)
-                        if c.promising or not guided
-                    ),
-                    *known,
-                ]
-            if guided and not self._still_best(mode, choice):
-                # What the sampler saw ahead changed the estimate: better to act on that.
-                return []
-            if not known:
-                self.guidance.record(mode, choice, success=False)
-                return []
-            lists.append(known)
-        if not lists:
-            return []
-        out = []
-        for _ in range(self.options.extensions):
-            pick = tuple(x[self._low_index(len(x))] for x in lists)
-            if pick not in out:
-                out.append(pick)
-        return out
-
-    def _low_index(self, n: int) -> int:
-        """An index below n, earlier ones more likely."""
-        return int(min(n - 1, self.rng.geometric(0.35) - 1))
-
-    def _discover_adjacent_orbit(self, orbit: int, combination: tuple[Candidate, ...]) -> None:
-        """Note the modal state that a sampled transition leads to."""
-        mode = self.graphs.mode(orbit)
-        self.graphs.discover(_after(mode, combination).state, mode.state)
-
     # -- tree -----------------------------------------------------------------------------------------------------
 
-    def _extend_tree(self, orbit: int, choices: list[Choice], candidates: list[tuple[Candidate, ...]]) -> None:
+    def _extend_tree(self, orbit: int, choices: list[Choice], candidates: list[Combination]) -> None:
         """Extend the tensor tree: towards the sampled transitions, towards the goal, and at random."""
         orbit = self.graphs.find(orbit)
         mode = self.graphs.mode(orbit)
@@ -461,79 +306,13 @@ class Planner:
     # -- skeletons ------------------------------------------------------------------------------------------------
 
     def _realise_skeletons(self) -> bool:
-        """Grow the sets of ways and realise the cheapest skeletons that may beat the incumbent, until one succeeds."""
-        first = self.best is None
-        if not first:
-            self._expand_roadmaps()
-        self.skeletons.grow(*(_FIRST_WAYS if first else _MORE_WAYS))
-        self.skeletons.update_bound()
-        if not first and self._uses("drafts") and self.portfolio.convex and self._draft():
-            return False
-        tries = 0
-        while tries < _REALISATIONS:
-            failed: set[int] = set()
-            inserted: list[tuple[float, Timed, Proposal]] = []
-            for proposal in self.skeletons.propose(_HOPE * self._to_beat(), _QUICK if first else _THOROUGH):
-                if failed & {id(way) for _, way in proposal.stops}:
-                    # The guidance has learnt something about these since.
-                    continue
-                tries += 1
-                best = self._cheapest_insertion(proposal)
-                if best is not None:
-                    inserted.append((*best, proposal))
-                    if first or len(inserted) == _RIVALS:
-                        break
-                    continue
-                node = self.growth.realise(proposal, self.skeletons, self.root)
-                if node is not None:
-                    self.skeletons.realised(proposal)
-                    return self._solution(node)
-                failed = {id(way) for _, way in proposal.stops if way.failures}
-                if tries >= _REALISATIONS:
-                    break
-            # An order of events that is under refinement already has had its chance.
-            for _, timed, proposal in sorted(inserted, key=lambda x: (self.portfolio.knows(x[1][1]), x[0])):
-                plan = self.incumbent.accepted(*timed)
-                if plan is not None:
-                    self.skeletons.realised(proposal)
-                    return self._adopt(plan)
-            if not failed:
-                return False
-        return False
-
-    def _draft(self) -> bool:
-        """Every other time, put the cheapest skeletons under refinement as they are; whether there was a new one.
-
-        Each robot is scheduled as if it were alone: where the others let it pass after some pushing and pulling, that
-        costs little more than the skeleton promised.
-        """
-        self._drafting = not self._drafting
-        if not self._drafting:
-            return False
-        drafts = []
-        for proposal in itertools.islice(self.skeletons.propose(_HOPE * self._to_beat(), _THOROUGH), _SKETCHED):
-            self.skeletons.realised(proposal)
-            timed = self.growth.insert(proposal, self.skeletons, self.root, alone=True)
-            drafts += [timed] if timed is not None else []
-        return self.portfolio.add_drafts(drafts, _DRAFTS) > 0
-
-    def _cheapest_insertion(self, proposal: Proposal) -> tuple[float, Timed] | None:
-        """The cheapest of several realisations of a skeleton in space and time, with its cost; None if the first fails.
-
-        They differ by chance, and what starts cheaper usually ends cheaper: far less work than refining all of them.
-        Before there is a plan, more than one is tried only where that is quick and the first far dearer than promised.
-        """
-        best: tuple[float, Timed] | None = None
-        for k in range(_INSERTIONS):
-            timed = self.growth.insert(proposal, self.skeletons, self.root, varied=k > 0)
-            if timed is not None:
-                cost = plan_cost(*timed, self.problem.cost)
-                if best is None or cost < best[0]:
-                    best = cost, timed
-            good = best is not None and best[0] < _POOR * proposal.skeleton.cost
-            if best is None or (self.best is None and (good or len(proposal.stops) > _MANY)):
-                break
-        return best
+        """Let the cheapest skeletons that may beat the incumbent have their turn; whether there is a better plan."""
+        if self.best is not None:
+            self.sampling.expand_roadmaps()
+        found = self.realisation.attempt()
+        if isinstance(found, Node):
+            return self._solution(found)
+        return found is not None and self._adopt(found)
 
     def _adopt(self, plan: Plan) -> bool:
         """A checked plan that the tree does not have yet: into the tree, and under refinement."""
@@ -556,7 +335,7 @@ class Planner:
         """Put a checked plan into the roadmaps and the tree; guidance follows its orbits from now on."""
         node = self.growth.adopt(plan.segments, plan.transitions, self.root)
         self._tree_cost = min(self._tree_cost, node.cost)
-        self._path = list(dict.fromkeys(x.orbit for x in self.tree.branch(node)))
+        self.orbit_guidance.path = list(dict.fromkeys(x.orbit for x in self.tree.branch(node)))
 
     # -- solutions ------------------------------------------------------------------------------------------------
 
@@ -597,7 +376,7 @@ class Planner:
                 return False
         better = self._offer(plan)
         if better:
-            self._path = [g[0].orbit for g in groups]
+            self.orbit_guidance.path = [g[0].orbit for g in groups]
         self._found(plan)
         return better
 
@@ -615,18 +394,7 @@ class Planner:
 
     def status(self) -> Status:
         """A snapshot for progress displays."""
-        nearest = min(self.modes(), key=self.guidance.remaining, default=None) if self.best is None else None
-        remaining = self.guidance.transitions_to_go(nearest) if nearest is not None else 0
-        return Status(
-            phase="first plan" if self.best is None else "improving",
-            iteration=self.iteration,
-            elapsed_s=self._spent,
-            modes=len(self.graphs.modal),
-            orbits=len(self.graphs.orbital),
-            nodes=len(self.tree.nodes),
-            remaining=remaining,
-            cost=self.best.cost if self.best else None,
-        )
+        return status_of(self, len(self.tree.nodes), self._spent)
 
     def modes(self) -> Iterator[Mode]:
         """One discovered mode per modal state."""
@@ -641,7 +409,7 @@ class Planner:
 
     def counts(self) -> dict[str, int]:
         """What was done, in numbers that do not depend on the machine: collision checks, IK calls and more."""
-        return {**self._counts.as_dict(), "ik_calls": self._counts.ik_attempts}
+        return self._counts.work()
 
     @property
     def trouble(self) -> Mapping[tuple[str, str], int]:
@@ -651,8 +419,3 @@ class Planner:
     def explain(self) -> str:
         """Why there is no plan yet: per stratum what was tried and what stopped it, and who blocked whose motion."""
         return explain(self)
-
-
-def _after(mode: Mode, combination: tuple[Candidate, ...]) -> Mode:
-    """The mode to which a simultaneous transition leads."""
-    return mode.after(Transition(tuple(c.action for c in combination)))

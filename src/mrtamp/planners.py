@@ -10,12 +10,17 @@ import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
-from mrtamp.mechanisms import PLANNER_NAMES
+from mrtamp.mechanisms import PLANNER_NAMES, check_without
 from mrtamp.problem import MrtampError, Problem
 
 if TYPE_CHECKING:
+    from mrtamp.baselines.composed_prm import ComposedOptions
+    from mrtamp.baselines.prioritised import PrioritisedOptions
     from mrtamp.plan import Plan
-    from mrtamp.planner import Status
+    from mrtamp.planner import Options
+    from mrtamp.status import Status
+
+    PlannerOptions = Options | ComposedOptions | PrioritisedOptions
 
 UNGUIDED = frozenset({"modal-guidance", "orbit-path-guidance", "skeletons"})
 """Mechanisms that the planner `unguided` does without (paper, "Proposed (unguided)")."""
@@ -62,7 +67,9 @@ class AnyPlanner(Protocol):
         ...
 
 
-def make_planner(name: str, problem: Problem, seed: int = 0, options: Mapping[str, Any] | Any = None) -> AnyPlanner:
+def make_planner(
+    name: str, problem: Problem, seed: int = 0, options: Mapping[str, Any] | PlannerOptions | None = None
+) -> AnyPlanner:
     """The planner called `name` for a problem.
 
     Parameters
@@ -80,7 +87,7 @@ def make_planner(name: str, problem: Problem, seed: int = 0, options: Mapping[st
     return PLANNERS[_known(name)](problem, seed, planner_options(name, options))
 
 
-def planner_options(name: str, options: Any = None) -> Any:
+def planner_options(name: str, options: Mapping[str, Any] | PlannerOptions | None = None) -> PlannerOptions:
     """The options object of the planner called `name`, from settings by name or another planner's options.
 
     Raises
@@ -105,6 +112,8 @@ def planner_options(name: str, options: Any = None) -> Any:
         raise MrtampError(f"options: {name} has no {', '.join(unknown)}; choose from {', '.join(known)}")
     if "without" in given:
         given["without"] = frozenset(given["without"])
+        # Here and not by its options alone: guided and unguided share theirs, and the error names what was asked for.
+        check_without(name, given["without"])
     return kind(**given)
 
 

@@ -11,21 +11,24 @@ import threading
 import time
 import uuid
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mrtamp.cluster import Link, Outcome, Pool, link, pool
 from mrtamp.plan import Plan
 from mrtamp.plan_file import plan_from_dict, plan_to_dict
-from mrtamp.planner import Options, Planner
-from mrtamp.planners import make_planner
+from mrtamp.planner import Planner
+from mrtamp.planners import make_planner, planner_options
 from mrtamp.problem import MrtampError, Problem
 from mrtamp.problem_file import problem_from_dict, problem_to_dict
+
+if TYPE_CHECKING:
+    from mrtamp.planners import PlannerOptions
 
 _PERIOD_S = 0.3
 """Seconds between two looks of a seed at the bound, and between two plans that it sends."""
@@ -42,7 +45,7 @@ class Order:
     problem: dict[str, Any]
     seed: int
     planner: str
-    options: Options
+    options: PlannerOptions
     budget_s: float | None
     iterations: int | None
     first: bool
@@ -161,7 +164,7 @@ def plan_seed(order: Order) -> SeedReport:
     return SeedReport(
         None if best is None else best.cost,
         planner.explain() if best is None else "",
-        planner.sampled_bound if isinstance(planner, Planner) else None,
+        planner.sampled_bound,
         planner.counts(),
     )
 
@@ -177,7 +180,7 @@ class SeedPortfolio:
     problem : what to plan.
     seeds : of the planners, all different.
     scheduler : address of a Dask scheduler with at least as many workers; None: processes of this machine.
-    planner, options : name and settings of the planners, see `mrtamp.planners`.
+    planner, options : name and settings of the planners, see `mrtamp.planners.make_planner`.
 
     Attributes
     ----------
@@ -187,7 +190,7 @@ class SeedPortfolio:
 
     Raises
     ------
-    MrtampError : there is no seed, or one twice.
+    MrtampError : there is no seed, or one twice; no planner or option has that name.
     """
 
     def __init__(
@@ -197,7 +200,7 @@ class SeedPortfolio:
         *,
         scheduler: str | None = None,
         planner: str = "guided",
-        options: Options | None = None,
+        options: Mapping[str, Any] | PlannerOptions | None = None,
     ) -> None:
         self.problem = problem
         self.seeds = tuple(seeds)
@@ -205,7 +208,7 @@ class SeedPortfolio:
             raise MrtampError(f"found the seeds {list(seeds)}, expected at least one, all different")
         self.scheduler = scheduler
         self.planner = planner
-        self.options = options or Options()
+        self.options = planner_options(planner, options)
         self.best: Plan | None = None
         self.reports: dict[int, SeedReport] = {}
         self.failures: dict[int, str] = {}
@@ -224,7 +227,10 @@ class SeedPortfolio:
 
         Parameters
         ----------
-        budget_s : seconds by the clock, the start of the workers included.  iterations : of every seed.
+        budget_s : seconds by the clock since the call.  What it takes to start the workers (a few seconds for processes
+            of this machine) and to build the planners is part of it; seeds plan in what is left, and get up to a second
+            more to finish the iteration that they are in.
+        iterations : of every seed.
         first : stop after the first plan of any seed.
         progress : called with a line that says how far the seeds are.
 
@@ -358,7 +364,7 @@ def plan_portfolio(
     Parameters
     ----------
     seeds : of the planners, all different; each has a process of its own.
-    budget_s : seconds by the clock, the start of the workers (about two) included.
+    budget_s : seconds by the clock, the start of the workers included, see `SeedPortfolio.improve`.
     scheduler : address of a Dask scheduler, as in `tcp://host:8786`; None: this machine.
     on_better : called with every plan that is better than all before it.
 

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, TextIO
 
 if TYPE_CHECKING:
-    from mrtamp.planner import Status
+    from mrtamp.status import Status
 
 TERMINAL_PERIOD = 0.2
 """Seconds between two drawings on a terminal."""

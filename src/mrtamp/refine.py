@@ -18,7 +18,7 @@ import numpy as np
 from mrtamp.clearance import Clearance, Track
 from mrtamp.collision import RESOLUTION, Collision
 from mrtamp.modes import Mode
-from mrtamp.plan import Action, Segment, Transition
+from mrtamp.plan import Action, Plan, Segment, Transition
 from mrtamp.problem import CostWeights
 from mrtamp.retiming import Grid, Timing, cut, duration, simple_timing
 from mrtamp.roadmap import Roadmap
@@ -113,6 +113,22 @@ class Refiner:
         self._subdivide()
         self._measure()
         self._settle()
+
+    @classmethod
+    def of_plan(
+        cls, plan: Plan, validity: Validity, rng: np.random.Generator, resolution: float = RESOLUTION
+    ) -> Refiner:
+        """A refiner of a plan, priced as its problem says, with the roadmaps and collision queries of `validity`."""
+        return cls(
+            plan.segments,
+            plan.transitions,
+            plan.problem.cost,
+            validity.collision,
+            validity,
+            validity.roadmaps,
+            rng,
+            resolution,
+        )
 
     # -- representation -------------------------------------------------------------------------------------------
 

@@ -8,16 +8,19 @@ chain.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from mrtamp.collision import RESOLUTION, RobotWorld
+from mrtamp.collision import RESOLUTION, Collision, RobotWorld
+from mrtamp.problem import Problem, RobotAt
 
 _COARSE = 5
 _HAND = 0.1
+"""Distance (m) from the tool frame that is tracked along edges where nothing larger is carried."""
 _KEPT_SPHERES = 20_000
 """Edges per robot whose bounding spheres are kept (some 8 kB each): old ones are computed again when asked for."""
 
@@ -310,3 +313,33 @@ def lazy_path(
         else:
             return path
     return None
+
+
+def roadmaps_of(problem: Problem, collision: Collision) -> dict[str, Roadmap]:
+    """An empty roadmap for every robot, its edges sampled finely enough for the largest object it may carry."""
+    reach = max([_HAND, *(r for world in collision.worlds.values() for r in world.object_radius.values())])
+    return {robot.name: Roadmap(collision.worlds[robot.name], reach) for robot in problem.robots}
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Vertices by robot: where it starts, where it is at home, and, for some of them, where it has to end."""
+
+    start: dict[str, int]
+    home: dict[str, int]
+    goal: dict[str, int]
+
+
+def add_stations(problem: Problem, roadmaps: Mapping[str, Roadmap]) -> Stations:
+    """Put the configurations that a problem names on empty roadmaps; the starts become their first vertices."""
+    start, home, goal = {}, {}, {}
+    for robot in problem.robots:
+        name, roadmap = robot.name, roadmaps[robot.name]
+        start[name] = home[name] = roadmap.add_vertex(robot.start)
+        if np.max(np.abs(robot.home - robot.start)) > 0:
+            home[name] = roadmap.add_vertex(robot.home)
+        for condition in problem.goal:
+            if isinstance(condition, RobotAt) and condition.robot == name:
+                known = roadmap.find(condition.q)
+                goal[name] = roadmap.add_vertex(condition.q) if known is None else known
+    return Stations(start, home, goal)

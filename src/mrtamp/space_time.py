@@ -1,8 +1,8 @@
 """Motions of several robots in space and time: timed moves along given paths, inserted one after another.
 
-One step of time is one move of every robot, of at most `STEP`.  A leg is inserted at the earliest timing along its path
-that keeps clear of the others' timed moves, of their standing where they stopped, and of objects as they lie at that
-moment (DESIGN section 9, insertion).
+One step of time is one move of every robot, of at most `STEP`.  Legs (paths without times) and changes of mode go in,
+segments come out.  A leg is inserted at the earliest timing along its path that keeps clear of the others' timed moves,
+of their standing where they stopped, and of objects as they lie at that moment (DESIGN section 9, insertion).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import heapq
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,17 +28,22 @@ _NEAR = 0.012
 
 @dataclass(frozen=True, eq=False)
 class Leg:
-    """Robots that move together through rows of their tables; `path` maps each to (m + 1) row numbers."""
+    """Robots that move together through rows of their tables, free of the world and of objects as in `mode`.
+
+    `path` maps each of them to m + 1 row numbers.
+    """
 
     path: Mapping[str, list[int]]
     mode: Mode
 
     @property
     def robots(self) -> tuple[str, ...]:
+        """Who moves."""
         return tuple(self.path)
 
     @property
     def length(self) -> int:
+        """Number of moves m."""
         return len(next(iter(self.path.values()))) - 1
 
 
@@ -47,37 +53,58 @@ class Move:
 
     a: int
     b: int
-    mode: Mode | None
+    mode: Mode
+
+
+class _Sampled(NamedTuple):
+    """Centres (3, B, 3) of the bodies' spheres and the grasp frame G at both ends and the middle of a move.
+
+    No tracked point's way is longer than `travel` (m).
+    """
+
+    centres: np.ndarray
+    R_WG: np.ndarray
+    p_WG: np.ndarray
+    travel: float
 
 
 class Clearances:
-    """Cached answers: pairs of moving robots, and robots against objects that were elsewhere when they were checked."""
+    """Tables of configurations, and cached answers about moves between their rows.
+
+    The questions: robots against each other, and robots against objects that were elsewhere when their moves were
+    checked.  Answers hold whatever else is scheduled, so that schedules may share them.
+
+    Attributes
+    ----------
+    tables : robot -> configurations (n,), which only become more: see `row`.
+    """
 
     def __init__(self, collision: Collision, validity: Validity, names: Sequence[str]) -> None:
         self.collision = collision
         self.validity = validity
         self.worlds = {r: collision.worlds[r] for r in names}
         self.tables: dict[str, list[np.ndarray]] = {r: [] for r in names}
-        self.alone = False
-        """Whether every robot is scheduled as if there were no other."""
         self._pairs: dict[tuple, bool] = {}
         self._objects: dict[tuple, bool] = {}
-        self._sampled: dict[tuple[str, int, int], tuple[np.ndarray, np.ndarray, np.ndarray, float]] = {}
-        self._rows: dict[tuple, tuple[np.ndarray, np.ndarray | None]] = {}
+        self._sampled: dict[tuple[str, int, int], _Sampled] = {}
+        self._samples: dict[tuple, tuple[np.ndarray, np.ndarray | None]] = {}
         self._balls: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
 
     @property
     def size(self) -> int:
         """Number of cached answers and samples."""
-        return len(self._pairs) + len(self._objects) + len(self._rows) + len(self._balls) + len(self._sampled)
+        return len(self._pairs) + len(self._objects) + len(self._samples) + len(self._balls) + len(self._sampled)
 
     def row(self, robot: str, q: np.ndarray) -> int:
-        """Put a configuration into a robot's table."""
+        """Put a configuration (n,) into a robot's table; the number of its row."""
         self.tables[robot].append(q)
         return len(self.tables[robot]) - 1
 
     def prepare(self, robot: str, moves: Sequence[tuple[int, int]]) -> None:
-        """Sample moves (pairs of rows) at their ends and middles, all at once: bodies, hand and displacement."""
+        """Sample moves (pairs of rows) at their ends and middles, all at once.
+
+        Nothing has to be prepared, but many moves at once take far less time than each when it is asked about.
+        """
         world = self.worlds[robot]
         table = self.tables[robot]
         fresh = [m for m in dict.fromkeys(moves) if (robot, *m) not in self._sampled]
@@ -86,14 +113,15 @@ class Clearances:
         q = np.array([[table[a], (table[a] + table[b]) / 2, table[b]] for a, b in fresh])
         flat = q.reshape(-1, q.shape[2])
         centres = world.bounds.spheres(flat).reshape(len(fresh), 3, -1, 3)
-        R, p = world.tool.pose(flat)
-        R, p = R.reshape(-1, 3, 3, 3), p.reshape(-1, 3, 3)
-        tracked = np.concatenate([centres, p[:, :, None]], axis=2)
+        R_WG, p_WG = world.tool.pose(flat)
+        R_WG, p_WG = R_WG.reshape(-1, 3, 3, 3), p_WG.reshape(-1, 3, 3)
+        tracked = np.concatenate([centres, p_WG[:, :, None]], axis=2)
+        # Points move neither evenly nor straight: twice the faster half, and a tenth more.
         travel = 2.2 * np.linalg.norm(np.diff(tracked, axis=1), axis=3).max(axis=(1, 2))
-        for k, (i, j) in enumerate(fresh):
-            self._sampled[robot, i, j] = (centres[k], R[k], p[k], float(travel[k]))
+        for k, (a, b) in enumerate(fresh):
+            self._sampled[robot, a, b] = _Sampled(centres[k], R_WG[k], p_WG[k], float(travel[k]))
 
-    def _sample(self, robot: str, a: int, b: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    def _sample(self, robot: str, a: int, b: int) -> _Sampled:
         if (robot, a, b) not in self._sampled:
             self.prepare(robot, [(a, b)])
         return self._sampled[robot, a, b]
@@ -103,24 +131,23 @@ class Clearances:
         key = (robot, a, b, held)
         if key not in self._balls:
             world = self.worlds[robot]
-            centres, R, p, _ = self._sample(robot, a, b)
+            centres, R_WG, p_WG, _ = self._sample(robot, a, b)
             radii = world.bounds.radii
             if held is not None:
-                centres = np.concatenate([centres, (p + R @ held.X_PO[:3, 3])[:, None]], axis=1)
+                # What a hand holds has the grasp frame G for its parent P.
+                centres = np.concatenate([centres, (p_WG + R_WG @ held.X_PO[:3, 3])[:, None]], axis=1)
                 radii = np.append(radii, world.object_radius[held.object])
             middle = (centres.min(axis=0) + centres.max(axis=0)) / 2
             self._balls[key] = (middle, radii + np.linalg.norm(centres - middle, axis=2).max(axis=0))
         return self._balls[key]
 
-    def _samples(self, robots: Sequence[tuple[str, Move]]) -> int:
+    def _density(self, robots: Sequence[tuple[str, Move]]) -> int:
         """How many samples of a step keep every tracked point within the resolution from one to the next."""
-        travel = max(self._sample(robot, move.a, move.b)[3] for robot, move in robots)
+        travel = max(self._sample(robot, move.a, move.b).travel for robot, move in robots)
         return max(2, int(np.ceil(travel / RESOLUTION)) + 1)
 
     def apart(self, one: str, a: Move, held_a: Attachment | None, two: str, b: Move, held_b: Attachment | None) -> bool:
-        """Whether two robots keep clear of each other in one step; always while they are taken to be `alone`."""
-        if self.alone:
-            return True
+        """Whether two robots, with what they hold, keep clear of each other in one step."""
         if one > two:
             one, a, held_a, two, b, held_b = two, b, held_b, one, a, held_a
         key = (one, a.a, a.b, held_a, two, b.a, b.b, held_b)
@@ -137,7 +164,7 @@ class Clearances:
         gap = np.linalg.norm(ca[:, None] - cb[None], axis=2) - ra[:, None] - rb[None]
         if gap.min() > _NEAR:
             return True
-        n = self._samples([(one, a), (two, b)]) if (a.a, b.a) != (a.b, b.b) else 1
+        n = self._density([(one, a), (two, b)]) if (a.a, b.a) != (a.b, b.b) else 1
         qa, load_a = self._along(one, a, held_a, n)
         qb, load_b = self._along(two, b, held_b, n)
         ends = np.arange(n)[bisection_order(n)] % max(n - 1, 1) == 0
@@ -147,19 +174,19 @@ class Clearances:
     def _along(self, robot: str, move: Move, held: Attachment | None, n: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Samples (n, dof) of a move in bisection order, and the poses of the load there."""
         key = (robot, move.a, move.b, held, n)
-        known = self._rows.get(key)
+        known = self._samples.get(key)
         if known is None:
             t = np.linspace(0, 1, n)[bisection_order(n)][:, None]
             q = (1 - t) * self.tables[robot][move.a] + t * self.tables[robot][move.b]
             known = (q, None if held is None else load_poses(self.worlds[robot].tool, q, held))
-            self._rows[key] = known
+            self._samples[key] = known
         return known
 
     def among(self, robot: str, move: Move, held: Attachment | None, mode: Mode) -> bool:
         """Whether a move keeps clear of the objects that rest in `mode` but not in the mode it was checked in."""
         if move.mode is mode:
             return True
-        known = {r.chain for r in self.validity.resting(move.mode)} if move.mode is not None else set()
+        known = {r.chain for r in self.validity.resting(move.mode)}
         return all(
             self._misses(robot, move, held, r.name, r.chain, r.X_WO)
             for r in self.validity.resting(mode)
@@ -179,7 +206,7 @@ class Clearances:
             gap = np.linalg.norm(centres - X_WO[:3, 3], axis=1) - radii - world.object_radius[item]
             known = bool(gap.min() > _NEAR)
             if not known:
-                n = self._samples([(robot, move)]) if move.a != move.b else 1
+                n = self._density([(robot, move)]) if move.a != move.b else 1
                 t = np.linspace(0, 1, n)[:, None]
                 q = (1 - t) * self.tables[robot][move.a] + t * self.tables[robot][move.b]
                 known = world.first_hit(world.rows(q, held, {item: X_WO})) < 0
@@ -188,15 +215,28 @@ class Clearances:
 
 
 class SpaceTime:
-    """Timed moves of all robots, grown leg by leg and event by event; one step is one unit of time."""
+    """Timed moves of all robots, grown leg by leg and event by event; one step is one unit of time.
 
-    def __init__(self, clearance: Clearances, start: Mapping[str, np.ndarray], modes: Sequence[Mode]) -> None:
-        self.clearance = clearance
+    Attributes
+    ----------
+    modes : one after another; each event is a change to the next one, so one more mode has to be there than events.
+    events : when the mode changes, in order.
+    moves, held : robot -> what it does, and holds, in each step until its last leg ends; later it stands.
+    at : robot -> row of its table where it stands in the end.
+    free_from : robot -> when its last leg or event is over, so that another one may begin.
+    alone : whether each robot is scheduled as if there were no other.
+    """
+
+    def __init__(
+        self, clearances: Clearances, start: Mapping[str, np.ndarray], modes: Sequence[Mode], *, alone: bool = False
+    ) -> None:
+        self.clearances = clearances
+        self.alone = alone
         self.modes = list(modes)
         self.names = list(start)
         self.moves: dict[str, list[Move]] = {r: [] for r in self.names}
         self.held: dict[str, list[Attachment | None]] = {r: [] for r in self.names}
-        self.at: dict[str, int] = {r: clearance.row(r, q) for r, q in start.items()}
+        self.at: dict[str, int] = {r: clearances.row(r, q) for r, q in start.items()}
         self._stands_in: dict[str, Mode] = dict.fromkeys(self.names, self.modes[0])
         self.free_from = dict.fromkeys(self.names, 0)
         self.events: list[int] = []
@@ -204,7 +244,7 @@ class SpaceTime:
     def copy(self) -> SpaceTime:
         """A schedule to try things on; tables and answers are shared."""
         other = object.__new__(SpaceTime)
-        other.clearance, other.names = self.clearance, self.names
+        other.clearances, other.alone, other.names = self.clearances, self.alone, self.names
         other.modes, other.events = list(self.modes), list(self.events)
         other.moves = {r: list(x) for r, x in self.moves.items()}
         other.held = {r: list(x) for r, x in self.held.items()}
@@ -233,9 +273,16 @@ class SpaceTime:
         held = self.held[robot]
         return held[t] if t < len(held) else self._mode(t).held.get(robot)
 
+    def _apart(
+        self, one: str, a: Move, held_a: Attachment | None, two: str, b: Move, held_b: Attachment | None
+    ) -> bool:
+        """Whether two robots do not get in each other's way, which nobody does where each is scheduled alone."""
+        return self.alone or self.clearances.apart(one, a, held_a, two, b, held_b)
+
     def _clear(self, robot: str, move: Move, held: Attachment | None, t: int, others: Sequence[str]) -> bool:
-        return self.clearance.among(robot, move, held, self._mode(t)) and all(
-            self.clearance.apart(robot, move, held, o, self._move(o, t), self._holds(o, t)) for o in others
+        """Whether a move in the step from t to t + 1 keeps clear of objects and of what the others do then."""
+        return self.clearances.among(robot, move, held, self._mode(t)) and all(
+            self._apart(robot, move, held, o, self._move(o, t), self._holds(o, t)) for o in others
         )
 
     def insert(self, leg: Leg, *, certain: bool = False) -> bool:
@@ -303,13 +350,12 @@ class SpaceTime:
 
     def in_the_way(self, leg: Leg, among: Sequence[str] | None = None) -> list[str]:
         """Robots (of `among`, default all) that block a leg from where they stand in the end."""
-        pairs = [(r, path) for r, path in leg.path.items()]
         return [
             o
             for o in (self.names if among is None else among)
             if o not in leg.path
             and not all(
-                self.clearance.apart(
+                self._apart(
                     r,
                     Move(path[i], path[min(i + 1, leg.length)], leg.mode),
                     leg.mode.held.get(r),
@@ -317,7 +363,7 @@ class SpaceTime:
                     self.standing(o),
                     self._holds(o, self.end),
                 )
-                for r, path in pairs
+                for r, path in leg.path.items()
                 for i in range(leg.length + 1)
             )
         ]
@@ -354,11 +400,9 @@ class SpaceTime:
                     moves[r] = Move(moves[r].a, moves[r].b, after)
                 held = {r: after.held.get(r) if r in active else self._holds(r, s) for r in self.names}
                 for k, r in enumerate(self.names):
-                    if not self.clearance.among(r, moves[r], held[r], after):
+                    if not self.clearances.among(r, moves[r], held[r], after):
                         return False
-                    if not all(
-                        self.clearance.apart(r, moves[r], held[r], o, moves[o], held[o]) for o in self.names[k + 1 :]
-                    ):
+                    if not all(self._apart(r, moves[r], held[r], o, moves[o], held[o]) for o in self.names[k + 1 :]):
                         return False
             return True
         finally:
@@ -367,7 +411,7 @@ class SpaceTime:
     def segments(self) -> list[Segment]:
         """The schedule as segments, one per mode."""
         end = self.end
-        tables = self.clearance.tables
+        tables = self.clearances.tables
         for r in self.names:
             self._wait(r, end)
         rows = {r: [*(m.a for m in self.moves[r][:end]), self.at[r]] for r in self.names}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import colorsys
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,29 +57,46 @@ def pick_place(robots: int = 2, objects: int = 4, layout_seed: int = 0) -> Probl
 
     Parameters
     ----------
-    robots, objects
-        How many: 1 to 8 and 1 to 24.
-    layout_seed
-        Chooses the layout; the same arguments give the same problem.
+    robots, objects : how many, 1 to 8 and 1 to 24.
+    layout_seed : chooses the layout; the same arguments give the same problem.
 
     Raises
     ------
-    ProblemError
-        A parameter is out of range.
+    ProblemError : a parameter is out of range.
     """
-    from mrtamp.problem_file import problem_from_dict  # here, because problem_file lists this generator
-
-    ensure_whole("pick_place", "robots", robots, 1, MAX_ROBOTS)
-    ensure_whole("pick_place", "objects", objects, 1, MAX_OBJECTS)
-    ensure_whole("pick_place", "layout_seed", layout_seed, 0)
-    return problem_from_dict(pick_place_dict(robots, objects, layout_seed))
+    sizes = {"robots": Size(robots, 1, MAX_ROBOTS), "objects": Size(objects, 1, MAX_OBJECTS)}
+    return generated("pick_place", pick_place_dict, layout_seed, **sizes)
 
 
-def ensure_whole(task: str, parameter: str, number: object, least: int, most: int | None = None) -> None:
-    """Refuse a parameter of a generated task that is no whole number within its range, ends included."""
-    if not isinstance(number, int) or number < least or (most is not None and number > most):
-        upto = "" if most is None else f" to {most}"
-        raise ProblemError(f"{task}: found {parameter}={number!r}, expected a whole number from {least}{upto}")
+@dataclass(frozen=True)
+class Size:
+    """How many of something a generated task is asked to have, and from how many to how many it may."""
+
+    number: int
+    least: int
+    most: int
+
+
+def generated(task: str, content: Callable[..., dict[str, Any]], layout_seed: int, **sizes: Size) -> Problem:
+    """The problem that `content` makes of the sizes and the layout seed, once these are known to be valid.
+
+    Raises
+    ------
+    ProblemError : one of them is no whole number, or out of its range.
+    """
+    from mrtamp.problem_file import problem_from_dict  # here, because problem_file lists the generators
+
+    for name, size in sizes.items():
+        if not _is_whole(size.number) or not size.least <= size.number <= size.most:
+            valid = f"a whole number from {size.least} to {size.most}"
+            raise ProblemError(f"{task}: found {name}={size.number!r}, expected {valid}")
+    if not _is_whole(layout_seed) or layout_seed < 0:
+        raise ProblemError(f"{task}: found layout_seed={layout_seed!r}, expected a whole number from 0")
+    return problem_from_dict(content(**{name: size.number for name, size in sizes.items()}, layout_seed=layout_seed))
+
+
+def _is_whole(number: object) -> bool:
+    return isinstance(number, int) and not isinstance(number, bool)
 
 
 def pick_place_dict(robots: int, objects: int, layout_seed: int = 0) -> dict[str, Any]:
@@ -87,38 +105,59 @@ def pick_place_dict(robots: int, objects: int, layout_seed: int = 0) -> dict[str
     bases = ring(robots)
     starts, goals = _layout(bases, objects, rng)
     yaws = rng.uniform(-45.0, 45.0, size=(2, objects))
-    side = round(2 * table_half_size(bases), 3)
-    name = f"pick_place_{robots}_{objects}"
     return {
         "mrtamp": 1,
-        "name": f"{name}_seed{layout_seed}" if layout_seed else name,
+        "name": problem_name("pick_place", layout_seed, robots, objects),
         "description": f"Simple pick and place: {robots} robots, {objects} cubes, layout {layout_seed}.",
-        "robots": [
-            {"name": f"arm{i + 1}", "model": "panda", "X_WB": pose(np.array([x, y]), 0.0, yaw)}
-            for i, (x, y, yaw) in enumerate(bases)
-        ],
-        "world": [
-            {
-                "name": "table",
-                "shape": {"box": [side, side, 0.1]},
-                "X_WB": {"translation": [0.0, 0.0, -0.05]},
-                "color": WOOD,
-            }
-        ],
-        "objects": [
-            {
-                "name": f"cube{i + 1}",
-                "shape": {"box": [CUBE] * 3},
-                "color": color(i, objects),
-                "start": {"on": "table", "X_WO": pose(starts[i], CUBE / 2, yaws[0, i])},
-            }
-            for i in range(objects)
-        ],
+        "robots": panda_arms(bases, [f"arm{i + 1}" for i in range(robots)]),
+        "world": [table_around(bases)],
+        "objects": cubes(starts, yaws[0]),
         "goal": [
             {"object": f"cube{i + 1}", "at": pose(goals[i], CUBE / 2, yaws[1, i]), "on": "table"}
             for i in range(objects)
         ],
     }
+
+
+# -- parts of problem files -------------------------------------------------------------------------------------------
+
+
+def problem_name(task: str, layout_seed: int, *sizes: int) -> str:
+    """The name of a generated problem; the first layout is the one without a seed in its name."""
+    return "_".join([task, *map(str, sizes), *([f"seed{layout_seed}"] if layout_seed else [])])
+
+
+def panda_arms(bases: np.ndarray, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Pandas at `bases` (robots, 3): x, y (m) and yaw (degrees)."""
+    return [
+        {"name": name, "model": "panda", "X_WB": pose(base[:2], 0.0, base[2])}
+        for name, base in zip(names, bases, strict=True)
+    ]
+
+
+def table(name: str, size: Sequence[float], x: float = 0.0) -> dict[str, Any]:
+    """A table of `size` (2,) with its top at height 0 and its middle at (x, 0) (m)."""
+    X_WB = {"translation": [x, 0.0, -0.05]}
+    return {"name": name, "shape": {"box": [*size, 0.1]}, "X_WB": X_WB, "color": WOOD}
+
+
+def table_around(bases: np.ndarray) -> dict[str, Any]:
+    """The square table that carries the `bases`."""
+    side = round(2 * table_half_size(bases), 3)
+    return table("table", [side, side])
+
+
+def cubes(starts: np.ndarray, yaws: np.ndarray) -> list[dict[str, Any]]:
+    """Cubes of different colours on the table, at points (n, 2) (m) and turned by angles (n,) (degrees)."""
+    return [
+        {
+            "name": f"cube{i + 1}",
+            "shape": {"box": [CUBE] * 3},
+            "color": color(i, len(starts)),
+            "start": {"on": "table", "X_WO": pose(start, CUBE / 2, yaw)},
+        }
+        for i, (start, yaw) in enumerate(zip(starts, yaws, strict=True))
+    ]
 
 
 def pose(xy: np.ndarray, z: float, yaw_deg: float) -> dict[str, Any]:
@@ -130,6 +169,9 @@ def pose(xy: np.ndarray, z: float, yaw_deg: float) -> dict[str, Any]:
 def color(i: int, n: int) -> list[float]:
     """The i-th of n colours that are easy to tell apart."""
     return [round(c, 3) for c in colorsys.hsv_to_rgb(i / n, 0.75, 0.85)]
+
+
+# -- layouts ----------------------------------------------------------------------------------------------------------
 
 
 def ring(robots: int) -> np.ndarray:

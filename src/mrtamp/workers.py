@@ -101,6 +101,8 @@ def remote_workers(scheduler: str) -> Iterator[Any]:
         except Exception as error:
             # Anything may answer at a wrong port, and in any way.
             reason = (str(error).splitlines() or [type(error).__name__])[0]
+            if isinstance(error, TimeoutError):
+                reason = f"nothing within {CONNECT_S:g} s"
             raise _wrong_address(scheduler, f"does not answer as one ({reason})") from None
         if kind != "Scheduler":
             raise _wrong_address(scheduler, f"is a {kind.lower()}")

@@ -14,9 +14,11 @@ from typing import Any
 import pytest
 
 import mrtamp
+from mrtamp.baselines.composed_prm import ComposedOptions
+from mrtamp.baselines.prioritised import PrioritisedOptions
 from mrtamp.check import check_plan
 from mrtamp.cli import main
-from mrtamp.mechanisms import PLANNER_NAMES
+from mrtamp.mechanisms import MECHANISMS_OF, PLANNER_NAMES
 from mrtamp.planner import Options, Planner
 from mrtamp.planners import PLANNERS, UNGUIDED, AnyPlanner, make_planner, planner_options
 from mrtamp.problem import MrtampError, Problem
@@ -30,6 +32,21 @@ def test_registry_has_every_name_and_a_clear_error_for_others() -> None:
     assert tuple(PLANNERS) == PLANNER_NAMES == ("guided", "unguided", "composed-prm", "prioritised")
     with pytest.raises(MrtampError, match=r"planner: 'best' is unknown; choose from guided, unguided, composed-prm"):
         make_planner("best", mrtamp.load_problem("square_free"))
+
+
+@pytest.mark.parametrize("name", PLANNER_NAMES)
+def test_mechanisms_that_a_planner_does_not_have_are_refused_in_its_name(name: str) -> None:
+    assert planner_options(name, {"without": MECHANISMS_OF[name]}).without == set(MECHANISMS_OF[name])
+    known = ", ".join(MECHANISMS_OF[name])
+    with pytest.raises(MrtampError, match=f"^without: {name} has no magic, sorcery; choose from {known}$"):
+        planner_options(name, {"without": ["sorcery", "refinement", "magic"]})
+
+
+def test_options_that_are_made_by_hand_are_looked_at_too() -> None:
+    magic = frozenset({"magic"})
+    for kind, name in ((Options, "guided"), (ComposedOptions, "composed-prm"), (PrioritisedOptions, "prioritised")):
+        with pytest.raises(MrtampError, match=f"without: {name} has no magic; choose from .*refinement"):
+            kind(without=magic)
 
 
 def test_unguided_is_the_planner_without_guidance_and_with_all_else() -> None:
@@ -144,4 +161,4 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert main([*command, "--without", "rewiring"]) == 2
     assert "composed-prm has no rewiring; choose from informed-sampling" in capsys.readouterr().err
     assert main([*command, "--intra-orbit", "prioritised"]) == 2
-    assert "composed-prm has no intra_orbit" in capsys.readouterr().err
+    assert "--intra-orbit: composed-prm has no such setting" in capsys.readouterr().err

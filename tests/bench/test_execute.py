@@ -9,16 +9,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
 from mrtamp.bench import measured
-from mrtamp.bench.execute import duration, execute, expected_s
+from mrtamp.bench.execute import Progress, duration, execute, expected_s
 from mrtamp.bench.measured import run_assignment
-from mrtamp.bench.records import Record, read_records, records_file
-from mrtamp.bench.run import apart
+from mrtamp.bench.records import Record, Times, read_records, records_file
+from mrtamp.bench.run import Point, apart
 from mrtamp.bench.suite import Assignment, load_suite
 from mrtamp.bench.table import Line
 from mrtamp.cli import main
@@ -52,6 +55,7 @@ def nothing(text: str) -> None: ...
 
 def test_a_run_records_what_it_took(tmp_path: Path) -> None:
     [assignment] = load_suite(write(tmp_path, 1, 4.0)).assignments()
+    environment = dict(os.environ)
     began = time.monotonic()
     told: list[str] = []
     record = run_assignment(assignment, told.append)
@@ -68,7 +72,7 @@ def test_a_run_records_what_it_took(tmp_path: Path) -> None:
     assert record.peak_mb is not None and record.peak_mb > 50
     assert record.machine is not None and record.machine.cores >= 1 and record.machine.drake in record.machine.text()
     assert told[0] == "planning" and "judging" in told
-    assert set(measured._THREADS) - set(os.environ) == {n for n in measured._THREADS if n not in os.environ}
+    assert dict(os.environ) == environment
 
 
 def _hang(assignment: Assignment, tell: Callable[[str], None]) -> Record:
@@ -99,6 +103,31 @@ def test_whatever_goes_wrong_in_a_run_is_in_its_record(
     record = run_assignment(assignment, nothing)
     assert record.error is not None and words in record.error
     assert record.first is None and record.times is None and record.key == assignment.key
+
+
+def _threads(tell: Callable[[str], None]) -> dict[str, str | None]:
+    return {name: os.environ.get(name) for name in ("SET_BEFORE", "SET_FOR_IT", "SET_FOR_BOTH")}
+
+
+def test_a_run_has_variables_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SET_BEFORE", "before")
+    monkeypatch.setenv("SET_FOR_BOTH", "before")
+    before = dict(os.environ)
+    its_own = {"SET_FOR_IT": "1", "SET_FOR_BOTH": "2"}
+    # Runs of several threads, as on a worker that takes more than one at a time.
+    with ThreadPoolExecutor(3) as executor:
+        runs = [executor.submit(apart, _threads, tell=nothing, environment=its_own) for _ in range(3)]
+    assert [run.result() for run in runs] == [{"SET_BEFORE": "before", **its_own}] * 3
+    assert dict(os.environ) == before
+
+
+def test_the_plans_that_count_are_judged() -> None:
+    """The first and the cheapest within the limit, whatever comes after it."""
+    plans: list[Any] = ["first", "cheapest", "worse", "late"]
+    points = [Point(t, cost, 1.0, 1.0) for t, cost in ((1.0, 9.0), (2.0, 7.0), (3.0, 8.0), (5.0, 6.0))]
+    assert measured._that_count(plans, points, 4.0) == ["first", "cheapest"]
+    assert measured._that_count(plans, points, 1.5) == ["first"]
+    assert measured._that_count(plans, points, 0.5) == []
 
 
 _ORPHAN = """
@@ -249,6 +278,42 @@ def test_failed_runs_are_run_again_only_when_asked(tmp_path: Path, monkeypatch: 
     execute(suite, tmp_path, quiet(), again=True)
     assert [(r.seed, r.error is None) for r in read_records(tmp_path)[1]] == [(1, True), (0, True)]
     assert len(lines(records_file(tmp_path))) == 4
+
+
+def test_time_left_counts_what_runs_have_behind_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, shown = 100.0, list[str]()
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    line = quiet()
+    monkeypatch.setattr(line, "show", shown.append)
+    ahead = list(load_suite(write(tmp_path, 4, 10.0)).assignments())
+    progress = Progress(ahead, 2, 2, line)
+    # Twelve seconds each as long as none is known.
+    assert progress.left() == pytest.approx(4 * 12 / 2)
+    for run in ahead[:2]:
+        progress.tell(run.key, "starting")
+    now += 9.0
+    assert progress.left() == pytest.approx((2 * 3 + 2 * 12) / 2)
+    times = Times(start=0.5, planning=10.0, judging=0.3, wall=11.0, cpu=10.0)
+    progress.finished(replace(measured.blank(ahead[0]), times=times))
+    assert shown[-1].startswith("3/6 runs, 12 s left; ") and progress.left() == pytest.approx((2 + 2 * 11) / 2)
+    progress.lost(ahead[1].key)
+    progress.finished(replace(measured.blank(ahead[2]), times=times))
+    # The last run has one worker to itself, and the other worker does not make it any shorter.
+    assert shown[-1].startswith("4/5 runs, 11 s left; ")
+    progress.tell(ahead[3].key, "starting")
+    now += 4.0
+    assert progress.left() == pytest.approx(7.0)
+
+
+def test_runs_that_are_not_wanted_are_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[str] = []
+    line = quiet()
+    monkeypatch.setattr(line, "show", shown.append)
+    monkeypatch.setattr(measured, "plan_assignment", _fail)
+    suite = load_suite(write(tmp_path, 3, 0.5))
+    execute(suite, tmp_path, quiet(), wanted=lambda assignment: assignment.seed == 0)
+    execute(suite, tmp_path, line, wanted=lambda assignment: assignment.seed == 1)
+    assert shown[0].startswith("0/1 runs, ") and shown[-1].startswith("1/1 runs, ")
 
 
 def test_time_to_wait(tmp_path: Path) -> None:

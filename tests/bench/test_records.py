@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from mrtamp.bench.machine import this_machine
 from mrtamp.bench.records import Record, Records, Times, read_records, records_file
 from mrtamp.bench.run import Point
-from mrtamp.bench.suite import Case, Entrant, Suite
+from mrtamp.bench.suite import Case, Entrant, Suite, suite_to_dict
 from mrtamp.problem import MrtampError
 
 SUITE = Suite("some", "", "main", (Case("box", 10.0),), (Entrant("guided", "guided"),), (0, 1, 2))
@@ -111,9 +112,32 @@ def test_a_wrong_line_is_named(line: bytes, tmp_path: Path) -> None:
         read_records(tmp_path)
 
 
-@pytest.mark.parametrize("content", [None, b"", b'{"mrtamp_bench": 7}\n'])
-def test_what_is_no_file_of_records_is_named(content: bytes | None, tmp_path: Path) -> None:
+SCALABILITY = json.dumps({"mrtamp_bench": 1, "suite": suite_to_dict(SUITE) | {"table": "scalability"}}).encode()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, r"found no runs\.jsonl in"),
+        (b"", r"runs\.jsonl:1: found no mrtamp_bench: 1"),
+        (b'{"mrtamp_bench": 7}', r"runs\.jsonl:1: found no mrtamp_bench: 1"),
+        (b'{"mrtamp_bench": 1}', r"runs\.jsonl:1: suite: found nothing, expected a mapping with the keys mrtamp_suite"),
+        (b'{"mrtamp_bench": 1, "suite": 5}', r"runs\.jsonl:1: suite: found 5, expected a mapping"),
+        (SCALABILITY, r"runs\.jsonl:1: suite: problems\[0\]: the table scalability needs the keys robots and objects"),
+    ],
+)
+def test_what_is_no_file_of_records_is_named(content: bytes | None, words: str, tmp_path: Path) -> None:
     if content is not None:
-        records_file(tmp_path).write_bytes(content)
-    with pytest.raises(MrtampError, match=r"runs\.jsonl"):
+        records_file(tmp_path).write_bytes(content + b"\n" if content else content)
+    with pytest.raises(MrtampError, match=words):
         read_records(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [("file", "it is no folder"), ("file/deeper", "Not a directory"), ("/proc/nowhere", "No such file")],
+)
+def test_a_folder_that_cannot_be_written_is_named(place: str, reason: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("taken")
+    with pytest.raises(MrtampError, match=rf"{place}: cannot be written to: .*{reason}.*--out DIR"):
+        Records(tmp_path / place, SUITE).__enter__()

@@ -59,6 +59,18 @@ def test_runs_of_the_same_instance_are_not_taken_for_independent_ones() -> None:
     assert covered["instances"] >= 0.9 * trials > 0.75 * trials >= covered["runs"]
 
 
+def test_ratios_within_instances_are_not_counted_twice() -> None:
+    """Instances that are all alike: their means vary as ratios within them do, and intervals are no wider than that."""
+    rng = np.random.default_rng(10)
+    truth, covered, trials = 2.0, 0, 400
+    for _ in range(trials):
+        instances = [(truth * np.exp(rng.normal(0, 0.5, size=5))).tolist() for _ in range(10)]
+        found = geometric_mean_ratio(instances, rng, resamples=1000)
+        assert found is not None
+        covered += found.low <= truth <= found.high
+    assert 0.91 <= covered / trials <= 0.985
+
+
 def test_a_ratio_and_its_inverse_have_inverse_intervals() -> None:
     ratios = [[0.5, 0.8, 1.2, 0.7, 0.9]]
     one = geometric_mean_ratio(ratios, np.random.default_rng(5), resamples=20_000)

@@ -127,6 +127,11 @@ def test_a_problem_file_is_found_beside_the_suite(tmp_path: Path) -> None:
         (("[informed-sampling]", "[skeletons]"), ["planners[2].without[0]", "informed-sampling"]),
         (("label: plain", "intra_orbit: prioritised"), ["planners[2].intra_orbit", "guided or unguided"]),
         (("label: plain", "label: guided"), ["planners", "'guided' twice"]),
+        (("label: plain", "label: ''"), ["planners[2].label", "not empty"]),
+        (
+            ("composed-prm, without: [informed-sampling]", "prioritised, without: [goal-bias]"),
+            ["planners[2].without[0]", "mechanisms of prioritised: refinement, factored-cache"],
+        ),
         (("problems:\n", "problems: []\nx:\n"), ["x", "unknown key"]),
     ],
 )

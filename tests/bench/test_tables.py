@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from multiprocessing.popen_spawn_posix import Popen
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from mrtamp.bench import costs as costs_module
 from mrtamp.bench import endurance as endurance_module
 from mrtamp.bench import first
 from mrtamp.bench.best import Best, BestKnown, best_known_file
-from mrtamp.bench.costs import COSTS, CostRow, cost_row, costs
+from mrtamp.bench.costs import COSTS, CostRow, Job, cost_row, costs
 from mrtamp.bench.endurance import course, endurance, endurance_row, growth, sampled
 from mrtamp.bench.run import Point, Run, Stopped, Task, apart, measure, pick_place
 from mrtamp.bench.table import Line
@@ -76,7 +77,7 @@ def test_a_row_without_a_plan_counts_as_the_whole_budget(
     monkeypatch.setattr(first, "start_to_exit", lambda: 1.0)
     monkeypatch.setattr(first, "FIRST_BUDGET_S", 0.0)
     assert not first.first_plans(1, [first.Row(Task("stacking"), 60.0, "-")], line)
-    assert "| stacking | 0/1 | 0.00 s | nan s |" in "\n".join(said)
+    assert "| stacking | 0/1 | 0.00 s | - | 60 s | - |" in "\n".join(said)
 
 
 def test_the_rows_are_the_tasks_of_the_paper() -> None:
@@ -227,14 +228,14 @@ def test_costs_are_written_only_when_asked(
 ) -> None:
     monkeypatch.setattr(costs_module, "measure", lambda task, seed, *_: run(seed=seed))
     file = tmp_path / "best.json"
-    row = CostRow(EASY, {10: 0.01})
     kept: list[Run] = []
-    assert costs(1, [5, 10], [row], BestKnown(file), line, command="mrtamp bench costs", keep=kept.append)
+    job = Job([CostRow(EASY, {10: 0.01})], 1, BestKnown(file), "mrtamp bench costs", keep=kept.append)
+    assert costs(job, [5, 10], line)
     assert not file.exists() and "not written: --update does" in "\n".join(said)
-    assert costs(1, [5, 10], [row], BestKnown(file), line, command="mrtamp bench costs", update=True)
+    assert costs(replace(job, known=BestKnown(file), update=True), [5, 10], line)
     [entry] = json.loads(file.read_text(encoding="utf-8"))["problems"]
     assert entry["problem"] == "square_free" and entry["command"] == "mrtamp bench costs"
-    assert [r.seed for r in kept] == [0] and "| square_free |" in said[1]
+    assert [r.seed for r in kept] == [0, 0] and "| square_free |" in said[1]
 
 
 @pytest.mark.parametrize(
@@ -269,7 +270,7 @@ def test_the_finished_seeds_stay_when_it_is_stopped(
 
     monkeypatch.setattr(costs_module, "measure", stopping)
     with pytest.raises(Stopped):
-        costs(5, [10], [CostRow(EASY)], BestKnown(tmp_path / "best.json"), line, command="x", update=True)
+        costs(Job([CostRow(EASY)], 5, BestKnown(tmp_path / "best.json"), "x", update=True), [10], line)
     assert "| 2/2 |" in said[1] and "(written)" in said[-1]
     assert BestKnown(tmp_path / "best.json").cost(EASY) == 10.5
 
@@ -303,10 +304,10 @@ def test_a_long_run_that_is_stopped_is_still_reported(
     monkeypatch.setattr(endurance_module, "measure", stopping)
     known = BestKnown(tmp_path / "best.json")
     with pytest.raises(Stopped):
-        endurance(10.0, 1, [CostRow(EASY)], known, line, command="x", update=True)
+        endurance(Job([CostRow(EASY)], 1, known, "x", update=True), 10.0, line)
     assert "1.0 min, stopped" in said[1] and BestKnown(known.file).cost(EASY) == 10.5
 
 
 def test_a_short_endurance_run(tmp_path: Path, line: Line, said: list[str]) -> None:
-    assert endurance(5 / 60, 1, [CostRow(EASY)], BestKnown(tmp_path / "best.json"), line, command="x")
+    assert endurance(Job([CostRow(EASY)], 1, BestKnown(tmp_path / "best.json"), "x"), 5 / 60, line)
     assert "| square_free | 0 |" in said[1] and " MB, cost " in said[2]

@@ -21,14 +21,13 @@ from mrtamp.guidance import ModalGuidance
 from mrtamp.incumbent import Incumbent
 from mrtamp.modes import Mode, start_mode
 from mrtamp.plan import Plan
-from mrtamp.planner import Status
-from mrtamp.problem import Problem, RobotAt
+from mrtamp.problem import Problem
 from mrtamp.refine import Refiner
-from mrtamp.roadmap import Roadmap
+from mrtamp.roadmap import add_stations, roadmaps_of
+from mrtamp.status import Status, status_of
 from mrtamp.transitions.sampler import TransitionSampler
 from mrtamp.validity import Validity
 
-_HAND = 0.1
 _SLICE = 50
 """Proposals of shortening between two looks at the clock."""
 _FINER = 3
@@ -52,8 +51,7 @@ class Anytime(ABC):
         self.rng = np.random.default_rng(seed)
         self._counts = Counts()
         self.collision = Collision(problem, self._counts)
-        reach = max([_HAND, *(r for w in self.collision.worlds.values() for r in w.object_radius.values())])
-        self.roadmaps = {r.name: Roadmap(self.collision.worlds[r.name], reach) for r in problem.robots}
+        self.roadmaps = roadmaps_of(problem, self.collision)
         self.names = list(self.roadmaps)
         self.validity = Validity(problem, self.collision, self.roadmaps, remember=factored_cache)
         self.sampler = TransitionSampler(problem, self.collision, self.roadmaps, self.validity, self.rng)
@@ -67,22 +65,8 @@ class Anytime(ABC):
         self.sampler.remember(self.root)
         self.graphs.discover(self.root.state)
         self._mode_of = {self.root.state: self.root}
-        self.start, self.home, self.goal = self._stations()
-
-    def _stations(self) -> tuple[dict[str, int], dict[str, int], dict[str, int]]:
-        """Vertices where the robots start, are at home, and (some of them) have to end."""
-        start, home, goal = {}, {}, {}
-        for robot in self.problem.robots:
-            roadmap = self.roadmaps[robot.name]
-            start[robot.name] = home[robot.name] = roadmap.add_vertex(robot.start)
-            if np.max(np.abs(robot.home - robot.start)) > 0:
-                home[robot.name] = roadmap.add_vertex(robot.home)
-        for condition in self.problem.goal:
-            if isinstance(condition, RobotAt):
-                roadmap = self.roadmaps[condition.robot]
-                known = roadmap.find(condition.q)
-                goal[condition.robot] = roadmap.add_vertex(condition.q) if known is None else known
-        return start, home, goal
+        stations = add_stations(problem, self.roadmaps)
+        self.start, self.home, self.goal = stations.start, stations.home, stations.goal
 
     @property
     def best(self) -> Plan | None:
@@ -151,7 +135,7 @@ class Anytime(ABC):
         """A checked plan made from `plan` by shortcuts robot by robot, where that is cheaper."""
         resolution = RESOLUTION
         for _ in range(_FINER):
-            refiner = self._refiner(plan, resolution)
+            refiner = Refiner.of_plan(plan, self.validity, self.rng, resolution)
             done = 0
             while done < proposals and not self._late():
                 refiner.improve(min(_SLICE, proposals - done))
@@ -164,18 +148,6 @@ class Anytime(ABC):
             # Something slipped between the samples.
             resolution /= 2
         return None
-
-    def _refiner(self, plan: Plan, resolution: float) -> Refiner:
-        return Refiner(
-            plan.segments,
-            plan.transitions,
-            self.problem.cost,
-            self.collision,
-            self.validity,
-            self.roadmaps,
-            self.rng,
-            resolution,
-        )
 
     # -- reports --------------------------------------------------------------------------------------------------
 
@@ -190,21 +162,11 @@ class Anytime(ABC):
 
     def status(self) -> Status:
         """A snapshot for progress displays."""
-        nearest = min(self.modes(), key=self.guidance.remaining) if self.best is None else None
-        return Status(
-            phase="first plan" if self.best is None else "improving",
-            iteration=self.iteration,
-            elapsed_s=self._spent,
-            modes=len(self.graphs.modal),
-            orbits=0,
-            nodes=self.nodes,
-            remaining=self.guidance.transitions_to_go(nearest) if nearest is not None else 0,
-            cost=self.best.cost if self.best else None,
-        )
+        return status_of(self, self.nodes, self._spent)
 
     def counts(self) -> dict[str, int]:
         """What was done, in numbers that do not depend on the machine."""
-        return {**self._counts.as_dict(), "ik_calls": self._counts.ik_attempts}
+        return self._counts.work()
 
     def explain(self) -> str:
         """Why there is no plan yet."""

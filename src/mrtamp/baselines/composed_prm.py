@@ -18,7 +18,7 @@ from mrtamp.baselines.composite import CompositeRoadmap, Layer
 from mrtamp.baselines.informed import ellipsoid_samples
 from mrtamp.baselines.multimodal import Crossing, Found, Multimodal
 from mrtamp.guidance import Choice
-from mrtamp.mechanisms import BASELINE_MECHANISMS
+from mrtamp.mechanisms import check_without
 from mrtamp.modes import goal_mode
 from mrtamp.plan import Plan, Segment, Transition
 from mrtamp.problem import MrtampError, Problem
@@ -52,7 +52,7 @@ class ComposedOptions:
     batch : composite configurations per iteration.  transitions : crossings per iteration.
     seeds : IK seeds per call of the transition sampler.
     shortcuts : proposals of shortening per plan.
-    without : names of what is switched off, see `mrtamp.mechanisms.BASELINE_MECHANISMS`.
+    without : names of what is switched off, see `mrtamp.mechanisms.MECHANISMS_OF`.
     """
 
     batch: int = 40
@@ -62,10 +62,7 @@ class ComposedOptions:
     without: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        unknown = sorted(self.without - set(BASELINE_MECHANISMS))
-        if unknown:
-            known = ", ".join(BASELINE_MECHANISMS)
-            raise MrtampError(f"without: composed-prm has no {', '.join(unknown)}; choose from {known}")
+        check_without("composed-prm", self.without)
 
 
 class ComposedPRM(Anytime):

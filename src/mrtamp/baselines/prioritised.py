@@ -16,20 +16,18 @@ import numpy as np
 
 from mrtamp.baselines.anytime import Anytime
 from mrtamp.baselines.timeline import Piece, Timeline
+from mrtamp.mechanisms import check_without
 from mrtamp.modes import Mode, goal_mode
 from mrtamp.plan import Action, Transition
-from mrtamp.problem import MrtampError, Problem
+from mrtamp.problem import Problem
+from mrtamp.roadmap_rows import RoadmapRows
 from mrtamp.skeleton_guidance import SkeletonGuidance
-from mrtamp.space_time import STEP, Clearances
 from mrtamp.steering import Steering
 from mrtamp.tensor_tree import At, Node
 from mrtamp.transitions.candidate import Candidate
 from mrtamp.transitions.projection import uniform_configurations
 from mrtamp.transitions.ways import Stop, Way, stop_of
 
-_KNOWN = ("refinement", "factored-cache")
-_TABLES = 60_000
-"""Cached answers after which the tables are emptied."""
 _DETOURS = 0.2
 """How often a robot takes another way than the shortest one, from the second attempt on."""
 _ALIKE = 1.1
@@ -44,7 +42,7 @@ class PrioritisedOptions:
     seeds, keep : IK seeds, and ways kept, per task and robots, each time that more are sampled.
     variety : how far, relative to its cost, a way may seem dearer or cheaper than it is when tasks are handed out.
     shortcuts : proposals of shortening per plan.
-    without : names of what is switched off: refinement, factored-cache.
+    without : names of what is switched off, see `mrtamp.mechanisms.MECHANISMS_OF`.
     """
 
     vertices: int = 80
@@ -56,9 +54,7 @@ class PrioritisedOptions:
     without: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        unknown = sorted(self.without - set(_KNOWN))
-        if unknown:
-            raise MrtampError(f"without: prioritised has no {', '.join(unknown)}; choose from {', '.join(_KNOWN)}")
+        check_without("prioritised", self.without)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,14 +85,10 @@ class Prioritised(Anytime):
         self.tasks = SkeletonGuidance(problem, self.sampler, self.guidance, self.root)
         self.steering = Steering(list(self.roadmaps.values()), self.validity, _no_tree, self.rng)
         self.steering.trouble = self.trouble
+        # Cost of the cheapest plan before shortening; whether robots go aside after their courses in this attempt.
         self._cheapest = np.inf
         self._courteous = True
-        self._forget()
-
-    def _forget(self) -> None:
-        self._clearances = Clearances(self.collision, self.validity, self.names)
-        self._rows: dict[tuple[str, int], int] = {}
-        self._edges: dict[tuple[str, int, int], list[int]] = {}
+        self._rows = RoadmapRows(self.roadmaps, self.collision, self.validity)
 
     def _add_interior(self, name: str, n: int) -> None:
         world = self.roadmaps[name].world
@@ -112,8 +104,7 @@ class Prioritised(Anytime):
     def _iterate(self) -> bool:
         for name in self.names:
             self._add_interior(name, self.options.interior)
-        if self._clearances.size > _TABLES:
-            self._forget()
+        self._rows.forget_if_full()
         self.tasks.grow(self.options.seeds, self.options.keep)
         jobs = self._hand_out(self.options.variety if self.iteration else 0.0)
         if jobs is None:
@@ -235,7 +226,7 @@ class Prioritised(Anytime):
     def _attempt(self, jobs: Sequence[Job], rank: Mapping[str, int]) -> Timeline | None:
         """The timeline of all jobs, planned robot by robot; None where something cannot be fitted in."""
         q = {r: self.roadmaps[r].q[v] for r, v in self.start.items()}
-        draft = _Draft(Timeline(self._clearances, q, self.root), dict(self.start), self.trouble)
+        draft = _Draft(Timeline(self._rows.clearances, q, self.root), dict(self.start), self.trouble)
         for k in self._order(jobs, rank):
             job = jobs[k]
             if not self._plan_job(draft, k, job):
@@ -295,11 +286,14 @@ class Prioritised(Anytime):
             return False
         draft.robot = robot
         draft.course += pieces
-        draft.row, draft.at[robot] = self._row(robot, v), v
+        draft.row, draft.at[robot] = self._rows.vertex(robot, v), v
         return True
 
     def _flush(self, draft: _Draft, around: Sequence[str] = ()) -> bool:
-        """Schedule a course before it is another robot's turn; in half of the attempts the robot then goes aside."""
+        """Schedule a course before it is another robot's turn, followed by a retreat in courteous attempts.
+
+        A retreat from the robots `around`, past where they stand, is part of every attempt.
+        """
         assert draft.robot is not None
         if not around and not self._courteous:
             return draft.flush()
@@ -307,6 +301,7 @@ class Prioritised(Anytime):
         return draft.flush(self._pieces(draft, draft.robot, aside, around) or [])
 
     def _pieces(self, draft: _Draft, robot: str, v: int, around: Sequence[str]) -> list[Piece] | None:
+        """A way to vertex v past the robots `around` where they stand, as pieces of a course; None if there is none."""
         others = set(self.names) - set(around)
         at = tuple(draft.at[r] for r in self.names)
         detour = self.iteration > 0 and self.rng.random() < _DETOURS
@@ -317,25 +312,8 @@ class Prioritised(Anytime):
                 break
         else:
             return None
-        rows = [self._row(robot, path[0])]
-        for a, b in itertools.pairwise(path):
-            rows += self._edge(robot, a, b)
-        self._clearances.prepare(robot, [*itertools.pairwise(rows), *zip(rows, rows, strict=True)])
+        rows = self._rows.path(robot, path, self._rows.vertex(robot, path[0]))
         return [Piece(a, b, mode) for a, b in itertools.pairwise(rows)]
-
-    def _row(self, robot: str, v: int) -> int:
-        if (robot, v) not in self._rows:
-            self._rows[robot, v] = self._clearances.row(robot, self.roadmaps[robot].q[v].copy())
-        return self._rows[robot, v]
-
-    def _edge(self, robot: str, a: int, b: int) -> list[int]:
-        """Rows along an edge from a to b, the first end excluded."""
-        if (robot, a, b) not in self._edges:
-            q = self.roadmaps[robot].q
-            n = max(1, int(np.ceil(np.linalg.norm(q[b] - q[a]) / STEP)))
-            inner = [self._clearances.row(robot, q[a] + (q[b] - q[a]) * (j / n)) for j in range(1, n)]
-            self._edges[robot, a, b] = [*inner, self._row(robot, b)]
-        return self._edges[robot, a, b]
 
 
 class _Draft:
@@ -344,6 +322,7 @@ class _Draft:
     Attributes
     ----------
     at : robot -> vertex where it is when all that is planned is over; `mode` is the mode then.
+    robot, course : whose course it is, and what it consists of so far; `row` is where it ends.  None: there is none.
     done : job -> when its last scheduled action happens.  planned : jobs that are complete.
     """
 

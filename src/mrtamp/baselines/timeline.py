@@ -2,7 +2,7 @@
 
 A course is a path of one robot with the changes of mode it makes on the way.  It keeps its path; when it moves and
 when it waits is found by A* over time and progress, so that it ends as early as it can.  What was scheduled before
-never changes.
+never changes, but for a robot's own retreats.  Courses go in, segments and transitions come out.
 """
 
 from __future__ import annotations
@@ -18,10 +18,8 @@ from mrtamp.modes import Attachment, Mode
 from mrtamp.plan import Action, Segment, Transition
 from mrtamp.space_time import Clearances, Move
 
-State = tuple[int, int]
-"""Time, and progress along a course."""
-_State = tuple[list[Move], int, int, Mode]
-"""Moves of a robot, where it stands in the end, when that is, and the mode in which it may stand there."""
+_Instant = tuple[int, int]
+"""Time, and how many pieces of a course are over then."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +35,29 @@ class Piece:
     action: Action | None = None
     earliest: int = 0
 
+    @property
+    def move(self) -> Move:
+        """What the robot does."""
+        return Move(self.a, self.b, self.mode)
+
 
 @dataclass(frozen=True)
 class Scheduled:
-    """An action and when it happens."""
+    """An action and when it happens; of actions at the same time, lower numbers come first."""
 
     time: int
     number: int
     action: Action
+
+
+@dataclass(frozen=True, eq=False)
+class _Stretch:
+    """What is scheduled of one robot: its moves, and the row, the time and the mode in which it stands afterwards."""
+
+    moves: tuple[Move, ...]
+    at: int
+    free_from: int
+    stands_in: Mode
 
 
 class Timeline:
@@ -55,20 +68,22 @@ class Timeline:
     at : robot -> row of its table where it stands in the end.
     free_from : robot -> when its last course ends.
     actions : what happens, in the order in which it was scheduled.
+    blame : "world" or robot -> how often it was in the way when a course was last fitted in.
     """
 
-    def __init__(self, clearance: Clearances, start: Mapping[str, np.ndarray], root: Mode) -> None:
-        self.clearance = clearance
+    def __init__(self, clearances: Clearances, start: Mapping[str, np.ndarray], root: Mode) -> None:
+        self.clearances = clearances
         self.names = list(start)
         self.root = root
-        self.at = {r: clearance.row(r, q) for r, q in start.items()}
+        self.at = {r: clearances.row(r, q) for r, q in start.items()}
         self.free_from = dict.fromkeys(self.names, 0)
         self.actions: list[Scheduled] = []
         self._moves: dict[str, list[Move]] = {r: [] for r in self.names}
         self._stands_in = dict.fromkeys(self.names, root)
         self._modes: dict[tuple[int, ...], Mode] = {(): root}
         self.blame: dict[str, int] = {}
-        self._retreats: dict[str, tuple[_State, tuple[Piece, ...]]] = {}
+        # Robots that have retreated: what had been scheduled of them before, and the way they went.
+        self._retreats: dict[str, tuple[_Stretch, tuple[Piece, ...]]] = {}
 
     @property
     def end(self) -> int:
@@ -83,7 +98,7 @@ class Timeline:
     def present(self, robot: str) -> Mode:
         """The mode when the next course of a robot may begin."""
         parked = self._retreats.get(robot)
-        return self._mode(parked[0][2] if parked is not None else self.free_from[robot])
+        return self._mode(parked[0].free_from if parked is not None else self.free_from[robot])
 
     def _mode(self, t: int, own: Sequence[Scheduled] = ()) -> Mode:
         """The mode from time t on; `own` are actions that are not scheduled yet."""
@@ -114,41 +129,44 @@ class Timeline:
         """
         parked = self._retreats.pop(robot, None)
         if parked is not None:
-            later = self._state(robot)
-            self._restore(robot, parked[0])
+            before, aside = parked
+            after = self._stretch(robot)
+            self._restore(robot, before)
             times = self._fit(robot, course, retreat)
             if times is not None:
                 return times
-            self._restore(robot, later)
-            course = [*(Piece(p.b, p.a, p.mode) for p in reversed(parked[1])), *course]
+            self._restore(robot, after)
+            course = [*(Piece(p.b, p.a, p.mode) for p in reversed(aside)), *course]
         return self._fit(robot, course, retreat)
 
     def _fit(self, robot: str, course: Sequence[Piece], retreat: Sequence[Piece]) -> list[int] | None:
         if not retreat:
             return self._schedule(robot, course)
-        before = self._state(robot), len(self.actions)
+        before = self._stretch(robot)
         times = self._schedule(robot, [*course, *retreat])
         if times is None:
             return self._schedule(robot, course)
         # The same moves once more, without the retreat: that is where the next course may begin.
         moves, rest = self._moves[robot], len(retreat)
         n = len(moves)
-        while rest and n > len(before[0][0]):
+        while rest and n > len(before.moves):
             n -= 1
             rest -= moves[n].a != moves[n].b
-        last = course[-1].b if course else before[0][1]
-        stands = course[-1].mode if course else before[0][3]
-        self._retreats[robot] = ((moves[:n], last, n, stands), tuple(retreat))
+        last = course[-1].b if course else before.at
+        stands = course[-1].mode if course else before.stands_in
+        self._retreats[robot] = (_Stretch(tuple(moves[:n]), last, n, stands), tuple(retreat))
         return times
 
-    def _state(self, robot: str) -> _State:
-        return list(self._moves[robot]), self.at[robot], self.free_from[robot], self._stands_in[robot]
+    def _stretch(self, robot: str) -> _Stretch:
+        """All that is scheduled of a robot so far, for `_restore`."""
+        return _Stretch(tuple(self._moves[robot]), self.at[robot], self.free_from[robot], self._stands_in[robot])
 
-    def _restore(self, robot: str, state: _State) -> None:
-        self._moves[robot], self.at[robot], self.free_from[robot], self._stands_in[robot] = state
-        self._moves[robot] = list(self._moves[robot])
+    def _restore(self, robot: str, was: _Stretch) -> None:
+        self._moves[robot], self.at[robot] = list(was.moves), was.at
+        self.free_from[robot], self._stands_in[robot] = was.free_from, was.stands_in
 
     def _schedule(self, robot: str, course: Sequence[Piece]) -> list[int] | None:
+        """Fit in a course so that it ends as early as it can; when its actions happen, or None."""
         if not course:
             return []
         begin, last = self.free_from[robot], max(self.end, *(p.earliest for p in course))
@@ -157,12 +175,12 @@ class Timeline:
         first = len(self.actions)
         self.blame = {}
         moves_left = [*np.cumsum([p.action is None for p in reversed(course)])[::-1].tolist(), 0]
-        parent: dict[State, State | None] = {(begin, 0): None}
+        parent: dict[_Instant, _Instant | None] = {(begin, 0): None}
         # Times of the own actions on the way to a state, all that the mode depends on beside the time.
-        acted: dict[State, tuple[int, ...]] = {(begin, 0): ()}
+        acted: dict[_Instant, tuple[int, ...]] = {(begin, 0): ()}
         queue: list[tuple[int, int, int]] = [(begin + moves_left[0], 0, begin)]
 
-        def own(state: State) -> list[Scheduled]:
+        def own(state: _Instant) -> list[Scheduled]:
             out: list[Scheduled] = []
             for k, t in zip(marks, acted[state], strict=False):
                 action = course[k].action
@@ -176,11 +194,11 @@ class Timeline:
             done = own(state)
             if i == len(course) and self._may_stay(robot, course, t, last, done, others):
                 return self._commit(robot, course, state, parent, done, begin)
-            following: list[State] = []
+            following: list[_Instant] = []
             if i < len(course) and course[i].action is not None:
                 if t >= course[i].earliest and self._bears(robot, course[i], t, [*done, self._next(course, done, t)]):
                     following.append((t, i + 1))
-            elif i < len(course) and self._clear(robot, course[i], t, done, others):
+            elif i < len(course) and self._clear(robot, course[i].move, t, done, others):
                 following.append((t + 1, i + 1))
             if t < last and self._clear(robot, self._wait(course, i), t, done, others):
                 following.append((t + 1, i))
@@ -192,26 +210,28 @@ class Timeline:
         return None
 
     def _next(self, course: Sequence[Piece], done: Sequence[Scheduled], t: int) -> Scheduled:
+        """The first action of a course that is not done, at time t."""
         action = [p.action for p in course if p.action is not None][len(done)]
         return Scheduled(t, len(self.actions) + len(done), action)
 
     @staticmethod
-    def _wait(course: Sequence[Piece], i: int) -> Piece:
+    def _wait(course: Sequence[Piece], i: int) -> Move:
+        """Standing still when i pieces of a course are over."""
         piece = course[min(i, len(course) - 1)]
         row = piece.a if i < len(course) else piece.b
         # At a change of mode one may stand before it as the piece before says, afterwards as the next one does.
         mode = course[i - 1].mode if i > 0 else piece.mode
-        return Piece(row, row, mode)
+        return Move(row, row, mode)
 
-    def _clear(self, robot: str, piece: Piece, t: int, done: Sequence[Scheduled], others: Sequence[str]) -> bool:
+    def _clear(self, robot: str, move: Move, t: int, done: Sequence[Scheduled], others: Sequence[str]) -> bool:
+        """Whether a move in the step from t to t + 1, own actions `done`, keeps clear of objects and of others."""
         mode = self._mode(t, done)
         held = mode.held.get(robot)
-        move = Move(piece.a, piece.b, piece.mode)
-        if not self.clearance.among(robot, move, held, mode):
+        if not self.clearances.among(robot, move, held, mode):
             self._note("world")
             return False
         for o in others:
-            if not self.clearance.apart(robot, move, held, o, self._move(o, t), self._held(o, t)):
+            if not self.clearances.apart(robot, move, held, o, self._move(o, t), self._held(o, t)):
                 self._note(o)
                 return False
         return True
@@ -233,16 +253,17 @@ class Timeline:
 
     def _bears(self, robot: str, piece: Piece, t: int, done: Sequence[Scheduled]) -> bool:
         """Whether what the others do from t on keeps clear of where things are after a change of mode."""
-        return self._all_clear(t, done, [robot], {robot: Piece(piece.b, piece.b, self._mode(t, done))})
+        return self._all_clear(t, done, {robot: Move(piece.b, piece.b, self._mode(t, done))})
 
-    def _all_clear(self, t: int, done: Sequence[Scheduled], active: Sequence[str], stand: Mapping[str, Piece]) -> bool:
-        """Whether all others keep clear, from t on, of resting objects, and at t of what the active robots hold."""
+    def _all_clear(self, t: int, done: Sequence[Scheduled], active: Mapping[str, Move]) -> bool:
+        """Whether all others keep clear, from t on, of resting objects, and at t of the active robots and their loads.
+
+        `active` : robot -> its standing at t.
+        """
         now = self._mode(t, done)
-        for r, piece in stand.items():
+        for r, stand in active.items():
             if not all(
-                self.clearance.apart(
-                    r, Move(piece.a, piece.a, piece.mode), now.held.get(r), o, self._move(o, t), self._held(o, t)
-                )
+                self.clearances.apart(r, stand, now.held.get(r), o, self._move(o, t), self._held(o, t))
                 for o in self.names
                 if o not in active
             ):
@@ -250,7 +271,7 @@ class Timeline:
         for s in range(t, max(self.end, t) + 1):
             mode = self._mode(s, done)
             for o in self.names:
-                if o not in active and not self.clearance.among(o, self._move(o, s), self._held(o, s), mode):
+                if o not in active and not self.clearances.among(o, self._move(o, s), self._held(o, s), mode):
                     self._note(o)
                     return False
         return True
@@ -259,8 +280,8 @@ class Timeline:
         self,
         robot: str,
         course: Sequence[Piece],
-        state: State,
-        parent: Mapping[State, State | None],
+        state: _Instant,
+        parent: Mapping[_Instant, _Instant | None],
         done: Sequence[Scheduled],
         begin: int,
     ) -> list[int]:
@@ -271,8 +292,7 @@ class Timeline:
         moves += [self._move(robot, t) for t in range(len(moves), begin)]
         for (t, i), (u, j) in itertools.pairwise(way[::-1]):
             if u > t:
-                piece = course[i] if j > i else self._wait(course, i)
-                moves.append(Move(piece.a, piece.b, piece.mode))
+                moves.append(course[i].move if j > i else self._wait(course, i))
         self.at[robot] = course[-1].b
         self.actions += done
         self.free_from[robot] = state[0]
@@ -288,8 +308,7 @@ class Timeline:
         for u in range(t, max(self.end, t) + 1):
             done = [Scheduled(u, len(self.actions), action)]
             mode = self._mode(u, done)
-            stand = {r: Piece(self.at[r], self.at[r], mode) for r in robots}
-            if not self._all_clear(u, done, robots, stand):
+            if not self._all_clear(u, done, {r: Move(self.at[r], self.at[r], mode) for r in robots}):
                 continue
             for r in robots:
                 self._moves[r] += [self._move(r, s) for s in range(len(self._moves[r]), u)]
@@ -304,7 +323,7 @@ class Timeline:
         """The schedule as segments and the transitions between them."""
         end = self.end
         happened = sorted(self.actions, key=lambda a: (a.time, a.number))
-        tables = self.clearance.tables
+        tables = self.clearances.tables
         q = {r: np.array([tables[r][self._move(r, t).a] for t in range(end + 1)]) for r in self.names}
         for r in self.names:
             q[r][end] = tables[r][self.at[r]]

@@ -13,9 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mrtamp.arguments import Parser, count, positive, seconds
+
 if TYPE_CHECKING:
-    from mrtamp.bench.best import BestKnown
-    from mrtamp.bench.run import Run
+    from mrtamp.bench.costs import Job
     from mrtamp.bench.suite import Suite
     from mrtamp.bench.table import Line
 
@@ -140,15 +141,10 @@ def _first(options: argparse.Namespace, line: Line) -> bool:
 
 
 def _costs(options: argparse.Namespace, line: Line) -> bool:
-    from mrtamp.bench.costs import COSTS, costs
+    from mrtamp.bench.costs import costs
 
-    rows = _rows(COSTS, options)
-    known = _best_known()
-    command = "mrtamp bench costs --budgets " + ",".join(f"{t:g}" for t in options.budgets)
-    with _raw(options.raw) as keep:
-        return costs(
-            options.seeds, options.budgets, rows, known, line, command=command, update=options.update, keep=keep
-        )
+    with _job(options, "costs --budgets " + ",".join(f"{t:g}" for t in options.budgets)) as job:
+        return costs(job, options.budgets, line)
 
 
 def _optimum(options: argparse.Namespace, line: Line) -> bool:
@@ -165,16 +161,10 @@ def _optimum(options: argparse.Namespace, line: Line) -> bool:
 
 
 def _endurance(options: argparse.Namespace, line: Line) -> bool:
-    from mrtamp.bench.costs import COSTS
     from mrtamp.bench.endurance import endurance
 
-    rows = _rows(COSTS, options)
-    known = _best_known()
-    command = f"mrtamp bench endurance --minutes {options.minutes:g}"
-    with _raw(options.raw) as keep:
-        return endurance(
-            options.minutes, options.seeds, rows, known, line, command=command, update=options.update, keep=keep
-        )
+    with _job(options, f"endurance --minutes {options.minutes:g}") as job:
+        return endurance(job, options.minutes, line)
 
 
 def _rows(rows: Sequence[Any], options: argparse.Namespace, name: Callable[[Any], str] = lambda row: row.name) -> list:
@@ -191,28 +181,29 @@ def _nothing(text: str, names: Sequence[str]) -> Exception:
     return MrtampError(f"--only: found {text!r}, expected part of one of: {'; '.join(names)}")
 
 
-def _best_known() -> BestKnown:
-    from mrtamp.bench.best import BestKnown, best_known_file
-
-    return BestKnown(best_known_file())
-
-
 @contextmanager
-def _raw(file: Path | None) -> Iterator[Callable[[Run], None]]:
-    """Collects runs; in the end, however it comes, they are in the file."""
+def _job(options: argparse.Namespace, command: str) -> Iterator[Job]:
+    """What `costs` and `endurance` measure; in the end, however it comes, the runs are in the file of --raw."""
+    from mrtamp.bench.best import BestKnown, best_known_file
+    from mrtamp.bench.costs import COSTS, Job
+
+    rows, known = _rows(COSTS, options), BestKnown(best_known_file())
     runs: list[dict[str, Any]] = []
     try:
-        yield lambda run: runs.append(run.as_dict())
+        yield Job(
+            rows,
+            options.seeds,
+            known,
+            f"mrtamp bench {command}",
+            options.update,
+            keep=lambda run: runs.append(run.as_dict()),
+        )
     finally:
-        if file is not None:
-            file.write_text(json.dumps({"runs": runs}, indent=1) + "\n", encoding="utf-8")
+        if options.raw is not None:
+            options.raw.write_text(json.dumps({"runs": runs}, indent=1) + "\n", encoding="utf-8")
 
 
 # -- arguments -------------------------------------------------------------------------------------------------------
-
-Converter = Callable[[str], float]
-Positive = Callable[[Callable[[str], float], str], Converter]
-"""Makes the converter of an argument from a type of number and what is expected, in words."""
 
 
 def add_bench(bench: argparse.ArgumentParser) -> None:
@@ -221,12 +212,13 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
     bench.description, bench.epilog = DESCRIPTION, _EPILOG
     bench.usage = "mrtamp bench SUITE [arguments]"
     bench.add_argument("what", metavar="SUITE", help="a shipped suite, a YAML file, or one of the words below")
-    bench.add_argument("arguments", nargs=argparse.REMAINDER, metavar="...", help="its arguments")
+    rest = bench.add_argument("arguments", nargs=argparse.REMAINDER, metavar="...", help="its arguments")
+    rest.required = False
 
 
-def parse(what: str, arguments: Sequence[str], positive: Positive) -> argparse.Namespace:
+def parse(what: str, arguments: Sequence[str]) -> argparse.Namespace:
     """The arguments of one of the things to do: `measure` does it; `files` are those that it will write."""
-    parser = argparse.ArgumentParser(prog=f"mrtamp bench {what}", description=COMMANDS.get(what))
+    parser = Parser(prog=f"mrtamp bench {what}", description=COMMANDS.get(what))
     parser.set_defaults(raw=None, plot=None, update=False)
     {
         "list": _list_arguments,
@@ -236,22 +228,20 @@ def parse(what: str, arguments: Sequence[str], positive: Positive) -> argparse.N
         "costs": _costs_arguments,
         "optimum": _optimum_arguments,
         "endurance": _endurance_arguments,
-    }.get(what, _suite_arguments)(parser, positive)
+    }.get(what, _suite_arguments)(parser)
     options = parser.parse_args(arguments)
     options.name = what
     options.files = [file for file in (options.raw, options.plot) if file is not None]
     return options
 
 
-def _suite_arguments(parser: argparse.ArgumentParser, positive: Positive) -> None:
-    count = positive(int, "a whole number from 1")
+def _suite_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Run a suite, or what is left of it, and report it."
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of records and report (default out/bench/SUITE)"
     )
     parser.add_argument("--seeds", type=count, metavar="N", help="planner seeds 0 to N-1 in place of the suite's")
-    limit = positive(float, "a positive number of seconds")
-    parser.add_argument("--limit", type=limit, metavar="S", help="seconds per run in place of the suite's limits")
+    parser.add_argument("--limit", type=seconds, metavar="S", help="seconds per run in place of the suite's limits")
     parser.add_argument(
         "--only", metavar="TEXT", default="", help="only runs whose name (problem, planner, seed) contains TEXT"
     )
@@ -270,24 +260,23 @@ def _suite_arguments(parser: argparse.ArgumentParser, positive: Positive) -> Non
     parser.set_defaults(measure=_suite)
 
 
-def _report_arguments(parser: argparse.ArgumentParser, positive: Positive) -> None:
+def _report_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="DIR", help="folder of the records")
     parser.set_defaults(measure=_report)
 
 
-def _compare_arguments(parser: argparse.ArgumentParser, positive: Positive) -> None:
+def _compare_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="DIR", help="folder of the records")
     parser.add_argument("a", metavar="A", help="label of a planner")
     parser.add_argument("b", metavar="B", help="label of the planner that A is divided by")
     parser.set_defaults(measure=_compare)
 
 
-def _list_arguments(parser: argparse.ArgumentParser, positive: Positive) -> None:
+def _list_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(measure=_list)
 
 
-def _rows_arguments(parser: argparse.ArgumentParser, positive: Positive, seeds: int) -> None:
-    count = positive(int, "a whole number from 1")
+def _rows_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
     parser.add_argument(
         "--seeds", type=count, default=seeds, metavar="N", help=f"planner seeds per row (default {seeds})"
     )
@@ -301,13 +290,13 @@ def _raw_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _first_arguments(parser: argparse.ArgumentParser, positive: Positive) -> None:
-    _rows_arguments(parser, positive, 5)
+def _first_arguments(parser: argparse.ArgumentParser) -> None:
+    _rows_arguments(parser, 5)
     parser.set_defaults(measure=_first)
 
 
-def _costs_arguments(parser: argparse.ArgumentParser, positive: Positive) -> None:
-    _rows_arguments(parser, positive, 5)
+def _costs_arguments(parser: argparse.ArgumentParser) -> None:
+    _rows_arguments(parser, 5)
     parser.add_argument(
         "--budgets",
         type=_budgets,
@@ -319,14 +308,14 @@ def _costs_arguments(parser: argparse.ArgumentParser, positive: Positive) -> Non
     parser.set_defaults(measure=_costs)
 
 
-def _optimum_arguments(parser: argparse.ArgumentParser, positive: Positive) -> None:
-    _rows_arguments(parser, positive, 10)
+def _optimum_arguments(parser: argparse.ArgumentParser) -> None:
+    _rows_arguments(parser, 10)
     parser.add_argument("--plot", type=_svg, metavar="FILE", help="draw every run, their mean and the optimum (SVG)")
     parser.set_defaults(measure=_optimum)
 
 
-def _endurance_arguments(parser: argparse.ArgumentParser, positive: Positive) -> None:
-    _rows_arguments(parser, positive, 1)
+def _endurance_arguments(parser: argparse.ArgumentParser) -> None:
+    _rows_arguments(parser, 1)
     parser.add_argument(
         "--minutes",
         type=positive(float, "a positive number of minutes"),

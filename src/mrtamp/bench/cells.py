@@ -109,7 +109,7 @@ def _titles_over(table: Table) -> list[str]:
 
 
 def number_texts(summary: Summary) -> tuple[str, str | None]:
-    """Mean and deviation with three significant digits of the mean, and as many decimals of the deviation."""
+    """Mean with three significant digits but no more than two decimals, the deviation with as many decimals."""
     size = abs(summary.mean)
     decimals = 0 if size >= 100 else 1 if size >= 10 else 2
     mean = f"{summary.mean:.{decimals}f}"

@@ -120,8 +120,8 @@ def comparison(suite: Suite, records: Sequence[Record], a: str, b: str) -> Table
 
 NOTES = (
     "Below 1 the first planner needs less. In brackets 95 % bootstrap intervals of the geometric mean (percentiles "
-    "expanded for small numbers; instances are resampled, where there are several, and runs within each; from less "
-    "than five of them intervals are too narrow all the same). In T_first a run without a plan counts as its limit, "
-    "so that the true ratio is farther from 1, and a pair without any plan as equal. Costs and collision checks are "
-    "compared where both runs have a plan; `pairs` says how many these are, and they are the easier ones."
+    "expanded for small numbers; where there are several instances, these are resampled, each with all its runs, else "
+    "runs; from less than five of them intervals are too narrow all the same). In T_first a run without a plan counts "
+    "as its limit, so that the true ratio is farther from 1, and a pair without any plan as equal. Costs and checks "
+    "are compared where both runs have a plan; `pairs` says how many these are, and they are the easier ones."
 )

@@ -14,6 +14,7 @@ from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 
+from mrtamp.bench.table import header, number, table_row
 from mrtamp.problem import MrtampError
 
 
@@ -84,8 +85,9 @@ def convergence(
     plot : the SVG file to write.
     """
     say(
-        "| problem | optimum | success | first plan, mean | at the end: mean | worst | best | budget | aim |\n"
-        f"|{'---|' * 9}"
+        header(
+            *("problem", "optimum", "success", "first plan, mean", "at the end: mean", "worst", "best", "budget", "aim")
+        )
     )
     good = True
     panels = []
@@ -101,10 +103,9 @@ def convergence(
         found = sum(bool(curve.costs) for curve in curves)
         # A plan that costs less than the optimum would mean that one of the two is wrong.
         good &= found == seeds and mean <= 1 + row.within and min(ends) >= 1 - ROUNDING
-        say(
-            f"| {row.problem} | {best:.4f} | {found}/{seeds} | {sum(firsts) / len(firsts):.3f} | {mean:.4f} "
-            f"| {max(ends):.4f} | {min(ends):.4f} | {row.budget_s:g} s | {1 + row.within:g} |"
-        )
+        cells = [number(sum(firsts) / len(firsts)), *(number(x, ".4f") for x in (mean, max(ends), min(ends)))]
+        success = f"{found}/{seeds}"
+        say(table_row(row.problem, number(best, ".4f"), success, *cells, f"{row.budget_s:g} s", f"{1 + row.within:g}"))
     say("\nCosts are divided by the optimum.")
     if plot is not None:
         plot.write_text(drawing(panels), encoding="utf-8")

@@ -42,28 +42,45 @@ COSTS = (
     CostRow(Task("stacking"), {10: 0.10, 60: 0.04}),
 )
 
-Keep = Callable[[Run], None]
-"""Puts a run away, for the file of raw data."""
+
+@dataclass(frozen=True)
+class Job:
+    """What is measured, and what becomes of the runs.
+
+    Attributes
+    ----------
+    rows, seeds : problems, and how many planner seeds each.
+    known : the best known costs; written only with `update`.
+    command : what was run, noted with costs that are better than the best known.
+    keep : puts a run away, for the file of raw data.
+    """
+
+    rows: Sequence[CostRow]
+    seeds: int
+    known: BestKnown
+    command: str
+    update: bool = False
+    keep: Callable[[Run], None] = lambda run: None
+
+    def take(self, row: CostRow, run: Run) -> Best | None:
+        """Put a run away; its best plan where it is cheaper than the best known, which it becomes."""
+        self.keep(run)
+        best = best_of(run, self.command)
+        lower = self.known.update if self.update else self.known.see
+        return best if best is not None and lower(row.task, best) else None
+
+    @property
+    def written(self) -> str:
+        """Whether costs that are better than the best known are on the disk, in words."""
+        return "written" if self.update else "not written: --update does"
 
 
-def costs(
-    seeds: int,
-    budgets: Sequence[float],
-    rows: Sequence[CostRow],
-    known: BestKnown,
-    line: Line,
-    *,
-    command: str,
-    update: bool = False,
-    keep: Keep = lambda run: None,
-) -> bool:
+def costs(job: Job, budgets: Sequence[float], line: Line) -> bool:
     """Print the table, row by row; returns whether every row is within its aims.
 
     Parameters
     ----------
     budgets : seconds after which costs are looked at, in ascending order; runs last as long as the last.
-    known : the best known costs; written only with `update`.
-    command : what was run, noted with costs that are better than the best known.
 
     Raises
     ------
@@ -85,35 +102,29 @@ def costs(
         )
     )
     good, notes = True, []
-    for row in rows:
+    for row in job.rows:
         runs: list[Run] = []
-        before, better = known.cost(row.task), ""
+        before, better = job.known.cost(row.task), ""
         try:
-            for seed in range(seeds):
+            for seed in range(job.seeds):
                 run = measure(row.task, seed, budgets[-1], line)
                 runs.append(run)
-                keep(run)
-                best = best_of(run, command)
-                if best is not None and (known.update if update else known.see)(row.task, best):
-                    better = _better(row, before, best, update)
+                best = job.take(row, run)
+                if best is not None:
+                    was = f"the best known was {before:.4f}" if before < float("inf") else "none was known"
+                    better = f"{row.name}, seed {best.seed}: a plan of cost {best.cost:.4f}; {was} ({job.written})"
         finally:
             if runs:
-                text, within = cost_row(row, runs, known.cost(row.task), budgets)
+                text, within = cost_row(row, runs, job.known.cost(row.task), budgets)
                 line.say(text)
                 good &= within
                 notes += [better] if better else []
                 for run in runs:
                     notes += [f"{row.name}, seed {run.seed}: {refusal}" for refusal in run.refused]
-            if len(runs) < seeds:
+            if len(runs) < job.seeds:
                 _explain(line, notes)
     _explain(line, notes)
     return good
-
-
-def _better(row: CostRow, before: float, best: Best, update: bool) -> str:
-    was = f"the best known was {before:.4f}" if before < float("inf") else "none was known"
-    what = "written" if update else "not written: --update does"
-    return f"{row.name}, seed {best.seed}: a plan of cost {best.cost:.4f}; {was} ({what})"
 
 
 def _explain(line: Line, notes: Sequence[str]) -> None:

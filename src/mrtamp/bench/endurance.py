@@ -5,8 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 
-from mrtamp.bench.best import BestKnown, best_of
-from mrtamp.bench.costs import CostRow, Keep
+from mrtamp.bench.costs import Job
 from mrtamp.bench.run import Run, Stopped, measure
 from mrtamp.bench.table import Line, header, number, table_row, yes_or_no
 
@@ -21,17 +20,7 @@ _LOOKS = 10
 """Moments at which cost and memory are printed."""
 
 
-def endurance(
-    minutes: float,
-    seeds: int,
-    rows: Sequence[CostRow],
-    known: BestKnown,
-    line: Line,
-    *,
-    command: str,
-    update: bool = False,
-    keep: Keep = lambda run: None,
-) -> bool:
+def endurance(job: Job, minutes: float, line: Line) -> bool:
     """Print the table, run by run, and the course of each; whether memory stays bounded and no plan is wrong.
 
     Raises
@@ -57,23 +46,21 @@ def endurance(
         )
     )
     good = True
-    for row in rows:
-        for seed in range(seeds):
+    for row in job.rows:
+        for seed in range(job.seeds):
             stopped = None
             try:
                 run: Run | None = measure(row.task, seed, 60 * minutes, line, salvage=True)
             except Stopped as stop:
                 stopped, run = stop, stop.run
             if run is not None:
-                keep(run)
-                best = best_of(run, command)
-                better = best is not None and (known.update if update else known.see)(row.task, best)
-                text, ok = endurance_row(run, known.cost(row.task))
+                better = job.take(row, run)
+                text, ok = endurance_row(run, job.known.cost(row.task))
                 good &= ok
                 line.say(text)
                 line.say(course(run))
-                if better:
-                    line.say(f"better than the best known ({'written' if update else 'not written: --update does'})")
+                if better is not None:
+                    line.say(f"better than the best known ({job.written})")
             if stopped is not None:
                 raise stopped
     return good

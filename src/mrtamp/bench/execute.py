@@ -43,14 +43,15 @@ def execute(
     """
     with Records(folder, suite) as records:
         done = {record.key for record in records.done if not (again and record.error is not None)}
-        ahead = [a for a in suite.assignments() if wanted(a) and a.key not in done]
-        progress = _Progress(ahead, len(done), workers, line)
+        all_wanted = [a for a in suite.assignments() if wanted(a)]
+        ahead = [a for a in all_wanted if a.key not in done]
+        progress = Progress(ahead, len(all_wanted) - len(ahead), workers, line)
         lost: list[str] = []
         if not ahead:
             return lost
         if workers == 1 and scheduler is None:
             for assignment in ahead:
-                progress.begin(assignment)
+                progress.tell(assignment.key, "starting")
                 record = run_assignment(assignment, partial(progress.tell, assignment.key))
                 records.add(record)
                 progress.finished(record)
@@ -64,46 +65,61 @@ def execute(
             for outcome in cluster.run(run_on_worker, tasks, hear=progress.tell):
                 if outcome.error is not None:
                     lost.append(f"{outcome.key}: {outcome.error.splitlines()[0]}")
+                    progress.lost(outcome.key)
                 else:
                     records.add(outcome.value)
                     progress.finished(outcome.value)
         return lost
 
 
-class _Progress:
-    """Says how many runs are done, how long the rest will take, and what the latest of them is at."""
+class Progress:
+    """Says how many runs are done, how long the rest will take, and what the latest of them is at.
+
+    Parameters
+    ----------
+    ahead : runs to do; `before` others are done already.
+    workers : runs at the same time.
+    """
 
     def __init__(self, ahead: Sequence[Assignment], before: int, workers: int, line: Line) -> None:
         self.workers = workers
         self._limits = {assignment.key: assignment.case.limit_s for assignment in ahead}
         self._total = len(ahead) + before
+        self._began: dict[str, float] = {}
         self._extra: list[float] = []
-        self._began = time.monotonic()
         self._line = line
 
-    def begin(self, assignment: Assignment) -> None:
-        """A run begins; its clock with it."""
-        self._began = time.monotonic()
-        self.tell(assignment.key, "starting")
-
     def tell(self, key: str, text: str) -> None:
-        """Something is heard of a run."""
-        done = self._total - len(self._limits)
-        self._line.show(f"{done}/{self._total} runs, {duration(self.left())} left; {key}: {text}")
+        """Something is heard of a run; it has begun when it is heard of first."""
+        self._began.setdefault(key, time.monotonic())
+        self._show(key, text)
 
     def finished(self, record: Record) -> None:
         """A run is over."""
-        self._limits.pop(record.key, None)
         if record.times is not None:
             self._extra.append(record.times.wall - record.limit_s)
-        self._began = time.monotonic()
-        self.tell(record.key, "done")
+        self._drop(record.key, "done")
+
+    def lost(self, key: str) -> None:
+        """A run will not be done this time."""
+        self._total -= 1
+        self._drop(key, "lost")
+
+    def _drop(self, key: str, text: str) -> None:
+        self._limits.pop(key, None)
+        self._began.pop(key, None)
+        self._show(key, text)
+
+    def _show(self, key: str, text: str) -> None:
+        done = self._total - len(self._limits)
+        self._line.show(f"{done}/{self._total} runs, {duration(self.left())} left; {key}: {text}")
 
     def left(self) -> float:
         """Seconds until the end, about."""
-        extra = statistics.mean(self._extra) if self._extra else _START_S
-        rest = sum(limit + extra for limit in self._limits.values())
-        return max(rest / self.workers - (time.monotonic() - self._began), 0.0)
+        extra, now = statistics.mean(self._extra) if self._extra else _START_S, time.monotonic()
+        rest = [max(limit + extra - (now - self._began.get(key, now)), 0.0) for key, limit in self._limits.items()]
+        # A run is not shared by workers, so that the longest of them has to be waited for.
+        return max(sum(rest) / self.workers, max(rest, default=0.0))
 
 
 def expected_s(suite: Suite) -> float:

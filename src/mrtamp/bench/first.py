@@ -5,7 +5,6 @@ Every row runs in a process of its own, so that nothing is warm and its peak mem
 
 from __future__ import annotations
 
-import statistics
 import subprocess
 import sys
 import time
@@ -13,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mrtamp.bench.run import Task, Tell, apart, peak_mb, pick_place
-from mrtamp.bench.table import Line
+from mrtamp.bench.table import Line, header, median, number, table_row
 
 FIRST_BUDGET_S = 60.0
 
@@ -84,23 +83,31 @@ def start_to_exit() -> float:
 def first_plans(seeds: int, rows: Sequence[Row], line: Line) -> bool:
     """Print the table of first plans, row by row; returns whether every row succeeded within its aim."""
     line.say(
-        "| problem | success | median first plan | slowest | aim | median cost | peak memory | the paper |\n"
-        f"|{'---|' * 8}"
+        header(
+            *("problem", "success", "median first plan", "slowest", "aim", "median cost", "peak memory", "the paper")
+        )
     )
     good = True
     for row in rows:
         result: Result = apart(measure, row.task, range(seeds), FIRST_BUDGET_S, tell=_shown(line, row.name))
         times = [t for t in result.seconds if t is not None]
         # A run without a plan counts as the whole budget.
-        median = statistics.median(t if t is not None else FIRST_BUDGET_S for t in result.seconds)
-        cost = statistics.median([c for c in result.costs if c is not None]) if times else float("nan")
-        good &= len(times) == seeds and median <= row.aim_s
+        middle = median([t if t is not None else FIRST_BUDGET_S for t in result.seconds])
+        good &= len(times) == seeds and middle <= row.aim_s
         line.say(
-            f"| {row.name} | {len(times)}/{seeds} | {median:.2f} s | {max(times, default=float('nan')):.2f} s "
-            f"| {row.aim_s:g} s | {cost:.1f} | {result.peak_mb:.0f} MB | {row.paper} |"
+            table_row(
+                row.name,
+                f"{len(times)}/{seeds}",
+                number(middle, ".2f", " s"),
+                number(max(times, default=None), ".2f", " s"),
+                f"{row.aim_s:g} s",
+                number(median([c for c in result.costs if c is not None]), ".1f"),
+                f"{result.peak_mb:.0f} MB",
+                row.paper,
+            )
         )
     line.show("a whole command, start to exit")
-    whole = statistics.median(start_to_exit() for _ in range(seeds))
+    whole = median([start_to_exit() for _ in range(seeds)])
     line.say(
         f"\n`mrtamp plan pick_place --robots 2 --objects 2 --first`, start to exit: median {whole:.2f} s (aim 4 s)"
     )

@@ -1,7 +1,7 @@
 """One run of a suite: any planner on any problem, in a process of its own, measured the same way for all of them.
 
-Times are read here, not from what planners say of themselves; the first and the last plan are saved, loaded again and
-judged from their files.
+Times are read here, not from what planners say of themselves; the first and the cheapest plan within the limit are
+saved, loaded again and judged from their files.
 """
 
 from __future__ import annotations
@@ -9,11 +9,10 @@ from __future__ import annotations
 import os
 import resource
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from multiprocessing import current_process
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mrtamp.bench.machine import this_machine
 from mrtamp.bench.records import Record, Times
@@ -47,29 +46,15 @@ def run_assignment(assignment: Assignment, tell: Tell) -> Record:
         heard.setdefault(text, time.perf_counter() - began)
         tell(text)
 
+    # With more threads times would depend on what else the machine does; whoever sets these wants it otherwise.
+    threads = {name: os.environ.get(name, "1") for name in _THREADS}
     try:
-        with _one_thread():
-            record: Record = apart(plan_assignment, assignment, tell=hear, patience=patience)
+        record: Record = apart(plan_assignment, assignment, tell=hear, patience=patience, environment=threads)
     except (TimeoutError, RuntimeError) as error:
         return replace(blank(assignment), error=str(error).strip(), machine=machine)
     assert record.times is not None
     times = replace(record.times, start=heard[_PLANNING], wall=time.perf_counter() - began)
     return replace(record, times=times, machine=machine)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Processes started in the block compute in one thread, unless somebody wants it otherwise.
-
-    With more of them times would depend on what else the machine does.
-    """
-    missing = [name for name in _THREADS if name not in os.environ]
-    os.environ.update(dict.fromkeys(missing, "1"))
-    try:
-        yield
-    finally:
-        for name in missing:
-            del os.environ[name]
 
 
 def run_on_worker(assignment: Assignment) -> Record:
@@ -94,8 +79,6 @@ def plan_assignment(assignment: Assignment, tell: Tell) -> Record:
     from mrtamp.planners import make_planner
 
     entrant, limit_s = assignment.entrant, assignment.case.limit_s
-    options: dict[str, Any] = {"without": entrant.without} if entrant.without else {}
-    options |= {"intra_orbit": entrant.intra_orbit} if entrant.intra_orbit else {}
     problem = assignment.case.task(assignment.layout).load()
     # What is loaded with the first use of the judge belongs to the start.
     import mrtamp.check  # noqa: F401
@@ -106,7 +89,7 @@ def plan_assignment(assignment: Assignment, tell: Tell) -> Record:
     first_counts: dict[str, int] = {}
     started = time.perf_counter()
     with Pulse(tell) as pulse:
-        planner = make_planner(entrant.planner, problem, assignment.seed, options)
+        planner = make_planner(entrant.planner, problem, assignment.seed, entrant.options())
         for plan in planner.improve(max(limit_s - (time.perf_counter() - started), 0.0)):
             points.append(Point(time.perf_counter() - started, plan.cost, **measures(plan.segments)))
             first_counts = first_counts or dict(planner.counts())
@@ -115,7 +98,7 @@ def plan_assignment(assignment: Assignment, tell: Tell) -> Record:
     planned = time.perf_counter()
     peak = peak_mb()
     tell(_JUDGING)
-    refused = refusals(_ends(plans))
+    refused = refusals(_that_count(plans, points, limit_s))
     why = "" if plans else planner.explain()[:_WHY]
     judged = time.perf_counter()
     usage = resource.getrusage(resource.RUSAGE_SELF)
@@ -137,9 +120,12 @@ def plan_assignment(assignment: Assignment, tell: Tell) -> Record:
     )
 
 
-def _ends(plans: Sequence[Plan]) -> list[Plan]:
-    """The plans that tables are made of."""
-    return [*plans[:1], *plans[1:][-1:]]
+def _that_count(plans: Sequence[Plan], points: Sequence[Point], limit_s: float) -> list[Plan]:
+    """The plans that tables are made of: the first and the cheapest of those within the limit, each once."""
+    within = [k for k, point in enumerate(points) if point.time_s <= limit_s]
+    if not within:
+        return []
+    return [plans[k] for k in sorted({within[0], min(within, key=lambda k: points[k].cost)})]
 
 
 def blank(assignment: Assignment) -> Record:

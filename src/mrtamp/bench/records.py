@@ -12,7 +12,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 from mrtamp.bench.machine import Machine
@@ -62,7 +61,7 @@ class Record:
     first_counts, counts : counters of the planner (collision checks, IK calls) when it had its first plan (empty
         without one), and in the end.
     times, peak_mb : None when the process did not live to tell.
-    refused : what the judge said against the first and the last plan, loaded from their files.
+    refused : what the judge said against the first and the cheapest plan within the limit, loaded from their files.
     why : what the planner says why there is no plan.
     error : why the run failed: a kill at its limit, or an exception.
     """
@@ -166,8 +165,13 @@ class Records:
         self.done: list[Record] = []
 
     def __enter__(self) -> Records:
-        self.file.parent.mkdir(parents=True, exist_ok=True)
-        stream = self.file.open("ab")
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            stream = self.file.open("ab")
+        except OSError as error:
+            reason = "it is no folder" if isinstance(error, FileExistsError) else error.strerror
+            found = f"{self.file.parent}: cannot be written to: {reason}"
+            raise MrtampError(f"{found}; name another folder (--out DIR)") from None
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -187,9 +191,7 @@ class Records:
         self._stream = stream
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._stream is not None:
             self._stream.close()
 
@@ -222,7 +224,7 @@ def _parse(file: Path) -> tuple[Suite, list[Record], int]:
         entries.append(entry)
     if not entries or entries[0].get(_HEADER) != RECORDS_VERSION:
         raise MrtampError(f"{file}:1: found no {_HEADER}: {RECORDS_VERSION}, expected records of `mrtamp bench`")
-    suite = suite_from_dict(entries[0]["suite"], f"{file}:1")
+    suite = suite_from_dict(entries[0].get("suite"), f"{file}:1: suite")
     records: dict[str, Record] = {}
     for number, entry in enumerate(entries[1:], 2):
         try:

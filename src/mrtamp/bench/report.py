@@ -95,7 +95,7 @@ def overhead_text(records: Sequence[Record]) -> str:
     judging, harness = part(t.judging for t in times), part(t.harness for t in times)
     return (
         f"Of the time of the runs, {planning} went into planning, {starting} into starting processes and loading, "
-        f"{judging} into saving, loading and judging the first and the last plan, and {harness} into the harness. "
+        f"{judging} into saving, loading and judging the first and the cheapest plan, and {harness} into the harness. "
         f"Planners went on after their limit for {statistics.mean(late):.2f} s in the mean, {max(late):.2f} s at most; "
         f"plans found then do not count. Processor time was {100 * busy:.0f} % of the time on the clock"
         + (

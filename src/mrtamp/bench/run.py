@@ -15,7 +15,8 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from multiprocessing import get_context
@@ -196,7 +197,7 @@ class Pulse:
         self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+    def __exit__(self, *_: object) -> None:
         self._over.set()
         self._thread.join()
 
@@ -245,6 +246,7 @@ def apart(
     tell: Tell,
     salvage: bool = False,
     patience: Mapping[str, float] | None = None,
+    environment: Mapping[str, str] | None = None,
 ) -> Any:
     """`function(*arguments, tell)` in a fresh process; what it tells arrives here.
 
@@ -252,6 +254,7 @@ def apart(
     ----------
     patience : what the function tells when it begins something -> seconds after which it has to have begun the next of
         these, or be finished ("" is the start of the process); then the process is killed.  None: wait for ever.
+    environment : variables that the process has besides those of this one.
 
     Raises
     ------
@@ -263,7 +266,7 @@ def apart(
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs, function, arguments), daemon=True)
     try:
-        with uninterrupted():
+        with uninterrupted(), _variables(environment or {}):
             process.start()
         theirs.close()
         try:
@@ -281,6 +284,25 @@ def apart(
         if process.pid is not None:
             process.kill()
             process.join()
+
+
+_starting = threading.Lock()
+
+
+@contextmanager
+def _variables(environment: Mapping[str, str]) -> Iterator[None]:
+    """Environment variables for the process that is started in the block, and for no other thread's."""
+    with _starting:
+        before = {name: os.environ.get(name) for name in environment}
+        os.environ.update(environment)
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
 
 
 def _ending(code: int | None) -> str:

@@ -52,8 +52,10 @@ def geometric_mean_ratio(
 
     Parameters
     ----------
-    ratios : positive numbers, one list per instance of a problem.  With several instances, instances are resampled and
-        the ratios within each, since runs on the same instance have much in common; with one, its ratios are.
+    ratios : positive numbers, one list per instance of a problem.  With several instances, instances are resampled,
+        each with all its ratios, since runs on the same instance have much in common; with one, its ratios are.  How
+        much ratios within an instance vary is in how much instances do: resampling them too would count it twice
+        (Davison and Hinkley, Bootstrap Methods and their Application, 1997, section 3.8).
 
     Returns
     -------
@@ -62,19 +64,13 @@ def geometric_mean_ratio(
     logs = [np.log(np.asarray(group, dtype=float)) for group in ratios if len(group)]
     if not logs:
         return None
-    estimate = float(np.exp(np.mean([group.mean() for group in logs])))
-    n = len(logs) if len(logs) > 1 else len(logs[0])
+    units = np.array([group.mean() for group in logs]) if len(logs) > 1 else logs[0]
+    estimate, n = float(np.exp(units.mean())), len(units)
     if n == 1:
         return Interval(estimate, 0.0, math.inf)
-    # (resamples, instances): the mean of a resampled instance, for every time that it may be drawn.
-    means = np.column_stack(
-        [group[rng.integers(len(group), size=(resamples, len(group)))].mean(axis=1) for group in logs]
-    )
-    if len(logs) > 1:
-        drawn = rng.integers(len(logs), size=(resamples, len(logs)))
-        means = np.take_along_axis(means, drawn, axis=1)
+    means = units[rng.integers(n, size=(resamples, n))].mean(axis=1)
     tail = expanded_tail(n)
-    low, high = np.quantile(means.mean(axis=1), [tail, 1 - tail])
+    low, high = np.quantile(means, [tail, 1 - tail])
     return Interval(estimate, float(np.exp(low)), float(np.exp(high)))
 
 

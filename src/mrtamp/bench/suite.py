@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from mrtamp.bench.run import Task
-from mrtamp.mechanisms import BASELINE_MECHANISMS, INTRA_ORBIT_NAMES, MECHANISMS, PLANNER_NAMES
+from mrtamp.mechanisms import INTRA_ORBIT_NAMES, INTRA_ORBIT_PLANNERS, MECHANISMS_OF, PLANNER_NAMES
 from mrtamp.problem import MrtampError
 from mrtamp.reading import Value, choices, data_document, read_document
 
@@ -34,8 +34,6 @@ TABLES = {
     "optimum": "a row per planner and problem, costs divided by the known optimum",
 }
 """Forms of the table that a suite is reported in."""
-_TREE_PLANNERS = ("guided", "unguided")
-"""Planners with the mechanisms of `MECHANISMS` and a choice of motion inside an orbit."""
 _PARAMETERS = ("robots", "objects")
 _PROBLEM_KEYS = (*_PARAMETERS, "layout", "layouts", "limit", "title")
 
@@ -74,6 +72,11 @@ class Entrant:
     label: str
     without: tuple[str, ...] = ()
     intra_orbit: str | None = None
+
+    def options(self) -> dict[str, Any]:
+        """Its settings by name, as `mrtamp.planners.make_planner` takes them."""
+        given: dict[str, Any] = {"without": self.without} if self.without else {}
+        return given | ({"intra_orbit": self.intra_orbit} if self.intra_orbit is not None else {})
 
 
 @dataclass(frozen=True)
@@ -151,9 +154,14 @@ def load_suite(source: str, *, find: bool = True) -> Suite:
     return read_suite(read_document(file).root, find=find)
 
 
-def suite_from_dict(data: Mapping[str, Any], label: str) -> Suite:
-    """The suite that `suite_to_dict` described; its problems and planners need not exist any more."""
-    return read_suite(data_document(dict(data), None, label).root, find=False)
+def suite_from_dict(data: Any, label: str) -> Suite:
+    """The suite that `suite_to_dict` described; its problems and planners need not exist any more.
+
+    Raises
+    ------
+    MrtampError : the data are not of a suite; the message begins with the label.
+    """
+    return read_suite(data_document(data, None, label).root, find=False)
 
 
 def read_suite(root: Value, *, find: bool = True) -> Suite:
@@ -165,8 +173,7 @@ def read_suite(root: Value, *, find: bool = True) -> Suite:
     cases = tuple(_case(entry, limit_s, find) for entry in _some(entries["problems"], "problem"))
     entrants = tuple(_entrant(entry, find) for entry in _some(entries["planners"], "planner"))
     table = entries["table"].choice(TABLES, "forms of tables")
-    if find:
-        _fits(table, entries["problems"].items(), cases)
+    _fits(table, entries["problems"].items(), cases)
     _unique([case.name for case in cases], entries["problems"], "problem")
     _unique([entrant.label for entrant in entrants], entries["planners"], "label")
     return Suite(
@@ -188,9 +195,8 @@ def suite_to_dict(suite: Suite) -> dict[str, Any]:
         problems.append(entry | ({"title": case.title} if case.title else {}))
     planners = []
     for entrant in suite.entrants:
-        entry = {"planner": entrant.planner, "label": entrant.label}
-        entry |= {"without": list(entrant.without)} if entrant.without else {}
-        planners.append(entry | ({"intra_orbit": entrant.intra_orbit} if entrant.intra_orbit else {}))
+        entry = {"planner": entrant.planner, "label": entrant.label, **entrant.options()}
+        planners.append(entry | ({"without": list(entrant.without)} if entrant.without else {}))
     return {
         "mrtamp_suite": SUITE_VERSION,
         "name": suite.name,
@@ -235,21 +241,19 @@ def _entrant(entry: Value, find: bool) -> Entrant:
     planner = entries["planner"].choice(PLANNER_NAMES, "planners") if find else entries["planner"].text()
     without: tuple[str, ...] = ()
     if "without" in entries:
-        known = MECHANISMS if planner in _TREE_PLANNERS else BASELINE_MECHANISMS
-        items = entries["without"].items()
-        without = tuple(i.choice(known, f"mechanisms of {planner}") if find else i.text() for i in items)
+        items, what = entries["without"].items(), f"mechanisms of {planner}"
+        without = tuple(i.choice(MECHANISMS_OF[planner], what) if find else i.text() for i in items)
     intra_orbit = None
     if "intra_orbit" in entries:
-        if planner not in _TREE_PLANNERS:
-            raise entries["intra_orbit"].error(f"{planner} has no such setting, expected it with {_either()} only")
+        if find and planner not in INTRA_ORBIT_PLANNERS:
+            either = " or ".join(INTRA_ORBIT_PLANNERS)
+            raise entries["intra_orbit"].error(f"{planner} has no such setting, expected it with {either} only")
         intra_orbit = entries["intra_orbit"].choice(INTRA_ORBIT_NAMES, "planners of motion inside an orbit")
     parts = [planner, *(f"without {name}" for name in without), *([f"with {intra_orbit}"] if intra_orbit else [])]
     label = entries["label"].text() if "label" in entries else ", ".join(parts)
+    if not label:
+        raise entries["label"].wrong("a text that is not empty")
     return Entrant(planner, label, without, intra_orbit)
-
-
-def _either() -> str:
-    return " or ".join(_TREE_PLANNERS)
 
 
 def _fits(table: str, entries: Sequence[Value], cases: Sequence[Case]) -> None:

@@ -18,8 +18,8 @@ Groups = Mapping[tuple[str, str], Sequence[Record]]
 
 _MEANS = (
     "SR is the share of runs with a plan within the limit, T_first the time to the first plan, J_first its cost and "
-    "J_final the cost of the best; mean ± standard deviation over the runs with a plan, which are the easier ones "
-    "where there are others."
+    "J_final the cost of the best; mean ± sample standard deviation over the runs with a plan, which are the easier "
+    "ones where there are others."
 )
 
 
@@ -116,8 +116,8 @@ def ablation_table(suite: Suite, records: Sequence[Record]) -> Table:
         if entrant.label != reference:
             both = [found for (name, _), found in pairs(records, entrant.label, reference).items() if name == case.name]
             ratios = [compared(both, measure).ratio for measure in MEASURES[:3]]
-        cell = (success(runs), first_time(runs), ratios[0], first_cost(runs), ratios[1], final_cost(runs), ratios[2])
-        return cell
+        means = [measured(runs) for measured in (first_time, first_cost, final_cost)]
+        return success(runs), *(cell for pair in zip(means, ratios, strict=True) for cell in pair)
 
     columns = [_SR, _T, Column("ratio"), _JF, Column("ratio"), _J, Column("ratio")]
     return _by_problem(
@@ -125,8 +125,9 @@ def ablation_table(suite: Suite, records: Sequence[Record]) -> Table:
         records,
         columns,
         cells,
-        f" Ratios are geometric means of pairs with {reference!r} on the same problem, layout and seed, with 95 % "
-        "bootstrap intervals; a run without a plan counts as its limit in T_first, and its pair is left out of costs.",
+        f" Ratios are the planner of the row divided by {reference!r}: geometric means over pairs of runs with the "
+        "same problem, layout and seed, and 95 % bootstrap intervals; a run without a plan counts as its limit in "
+        "T_first, and its pair is left out of costs.",
     )
 
 
@@ -173,7 +174,8 @@ def everything_table(suite: Suite, records: Sequence[Record]) -> Table:
         rows=table.rows,
         rules=table.rules,
         notes="Checks and calls do not depend on the machine: configurations asked of the collision checker, and "
-        "seeds projected by inverse kinematics.",
+        "seeds projected by inverse kinematics. Means and deviations as in the table above, of the runs with a plan; "
+        "peak memory is the most of all runs.",
     )
 
 

@@ -7,7 +7,6 @@ import statistics
 import threading
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import TextIO
 
 from mrtamp.progress import LOG_PERIOD, TERMINAL_PERIOD, LastLine
@@ -34,9 +33,7 @@ class Line:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._over.set()
         self._thread.join()
         self._line.clear()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -68,6 +69,17 @@ class Near:
     a: np.ndarray
     b: np.ndarray
     padding: np.ndarray
+
+
+class Situations(Protocol):
+    """What is held and what rests where, by the numbers of segments."""
+
+    @property
+    def modes(self) -> Sequence[Mode]:
+        """Mode by segment."""
+
+    def resting(self, mode: Mode) -> Mapping[str, np.ndarray]:
+        """World poses (4, 4) of the objects that rest in one of the modes."""
 
 
 class Carriers:
@@ -281,7 +293,7 @@ class Nearness:
                 rows[near, k : k + 7] = one[k : k + 7]
         return rows
 
-    def world(self, robot: str, state: State, samples: Samples, arrangement: Arrangement, reach: float) -> Near:
+    def world(self, robot: str, state: State, samples: Samples, arrangement: Situations, reach: float) -> Near:
         """What is within `reach` (m) of a robot and its load: itself, the static world, objects at rest."""
         world = self.worlds[robot]
         known = self._plant(world.scene)
@@ -333,7 +345,7 @@ class Nearness:
         robots: tuple[str, str],
         states: tuple[State, State],
         samples: Samples,
-        arrangement: Arrangement,
+        arrangement: Situations,
         reach: float,
     ) -> Near:
         """What is within `reach` (m) between two robots and their loads."""

@@ -141,10 +141,13 @@ class Shapes:
 
     def _within(self, p: np.ndarray, pairs: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
         """Samples and numbers of the pairs whose bounding spheres come within `reach` (m)."""
-        i, j = pairs.T
-        limit = self._bound[i] + self._bound[j] + reach
-        square = np.einsum("sgx,sgx->sg", p, p)
-        gap = square[:, i] + square[:, j] - 2 * (p @ np.swapaxes(p, 1, 2))[:, i, j]
+        if not len(pairs):
+            return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
+        (rows, i), (columns, j) = (np.unique(side, return_inverse=True) for side in pairs.T)
+        limit = self._bound[pairs].sum(axis=1) + reach
+        a, b = p[:, rows], p[:, columns]
+        square = np.einsum("sgx,sgx->sg", a, a)[:, :, None] + np.einsum("sgx,sgx->sg", b, b)[:, None]
+        gap = (square - 2 * (a @ np.swapaxes(b, 1, 2)))[:, i, j]
         # The squares of what is far from the origin cost some digits.
         s, c = np.nonzero(gap < limit**2 + 1e-6)
         return s, c

@@ -1,0 +1,149 @@
+"""Turning proposed skeletons into plans: as drafts, in space and time, or along the tensor tree (DESIGN section 9).
+
+Skeletons go in as `SkeletonGuidance` proposes them, cheapest first; what could not be realised is reported back to it
+and changes what it proposes next.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+from mrtamp.growth import Growth, Timed
+from mrtamp.incumbent import Incumbent
+from mrtamp.plan import Plan, plan_cost
+from mrtamp.portfolio import Portfolio
+from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
+from mrtamp.tensor_tree import Node
+
+_FIRST_WAYS, _MORE_WAYS = (80, 14), (64, 20)
+"""IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
+_REALISATIONS = 6
+"""Skeletons that are tried at a time."""
+_QUICK, _THOROUGH = 30, 300
+"""Orders evaluated per search for skeletons, before there is a plan and later."""
+_RIVALS, _INSERTIONS = 2, 3
+"""Skeletons of which the cheapest is refined, and realisations of each that are compared."""
+_SKETCHED, _DRAFTS = 4, 3
+"""Skeletons that are drafted at a time, and drafts of them that are refined."""
+_POOR = 2.0
+"""A first realisation that costs so many times what its skeleton promised is not the only one."""
+_MANY = 12
+"""Stops from which on a realisation takes too long for that."""
+
+
+class Realisation:
+    """Realises the skeletons of one problem.
+
+    Parameters
+    ----------
+    growth : realises skeletons in space and time, or along its tree.
+    skeletons : proposes them and learns what failed.
+    incumbent : has plans judged.  portfolio : takes drafts, and knows which orders of events are under refinement.
+    root : the tree's root, where every skeleton starts.
+    to_beat : cost that a skeleton has to promise less than.
+    drafts : whether skeletons are also put under refinement as they are.
+    """
+
+    def __init__(
+        self,
+        growth: Growth,
+        skeletons: SkeletonGuidance,
+        incumbent: Incumbent,
+        portfolio: Portfolio,
+        root: Node,
+        to_beat: Callable[[], float],
+        *,
+        drafts: bool = True,
+    ) -> None:
+        self.growth = growth
+        self.skeletons = skeletons
+        self.incumbent = incumbent
+        self.portfolio = portfolio
+        self.root = root
+        self.to_beat = to_beat
+        self.drafts = drafts
+        self._drafting = False
+
+    def attempt(self) -> Plan | Node | None:
+        """Grow the sets of ways and realise the cheapest skeletons that may beat the incumbent, until one succeeds.
+
+        Returns
+        -------
+        A checked plan that the tree does not have yet, a goal node of the tree, or None; also where drafts were made.
+        """
+        first = self._first
+        self.skeletons.grow(*(_FIRST_WAYS if first else _MORE_WAYS))
+        self.skeletons.update_bound()
+        if not first and self.drafts and self.portfolio.convex and self._draft():
+            return None
+        tries = 0
+        while tries < _REALISATIONS:
+            failed: set[int] = set()
+            inserted: list[tuple[float, Timed, Proposal]] = []
+            for proposal in self.skeletons.propose(self.to_beat(), _QUICK if first else _THOROUGH):
+                if failed & {id(way) for _, way in proposal.stops}:
+                    # The guidance has learnt something about these since.
+                    continue
+                tries += 1
+                best = self._cheapest_insertion(proposal)
+                if best is not None:
+                    inserted.append((*best, proposal))
+                    if first or len(inserted) == _RIVALS:
+                        break
+                    continue
+                node = self.growth.realise(proposal, self.skeletons, self.root)
+                if node is not None:
+                    self.skeletons.realised(proposal)
+                    return node
+                failed = {id(way) for _, way in proposal.stops if way.failures}
+                if tries >= _REALISATIONS:
+                    break
+            # An order of events that is under refinement already has had its chance.
+            for _, timed, proposal in sorted(inserted, key=lambda x: (self.portfolio.knows(x[1][1]), x[0])):
+                plan = self.incumbent.accepted(*timed)
+                if plan is not None:
+                    self.skeletons.realised(proposal)
+                    return plan
+            if not failed:
+                return None
+        return None
+
+    @property
+    def _first(self) -> bool:
+        """Whether there is no plan yet."""
+        return self.incumbent.best is None
+
+    def _draft(self) -> bool:
+        """Every other time, put the cheapest skeletons under refinement as they are; whether there was a new one.
+
+        Each robot is scheduled as if it were alone: where the others let it pass after some pushing and pulling, that
+        costs little more than the skeleton promised.
+        """
+        self._drafting = not self._drafting
+        if not self._drafting:
+            return False
+        drafts = []
+        for proposal in itertools.islice(self.skeletons.propose(self.to_beat(), _THOROUGH), _SKETCHED):
+            self.skeletons.realised(proposal)
+            timed = self.growth.insert(proposal, self.skeletons, self.root, alone=True)
+            drafts += [timed] if timed is not None else []
+        return self.portfolio.add_drafts(drafts, _DRAFTS) > 0
+
+    def _cheapest_insertion(self, proposal: Proposal) -> tuple[float, Timed] | None:
+        """The cheapest of several realisations of a skeleton in space and time, with its cost; None if the first fails.
+
+        They differ by chance, and what starts cheaper usually ends cheaper: far less work than refining all of them.
+        Before there is a plan, more than one is tried only where that is quick and the first far dearer than promised.
+        """
+        best: tuple[float, Timed] | None = None
+        for k in range(_INSERTIONS):
+            timed = self.growth.insert(proposal, self.skeletons, self.root, varied=k > 0)
+            if timed is not None:
+                cost = plan_cost(*timed, self.growth.problem.cost)
+                if best is None or cost < best[0]:
+                    best = cost, timed
+            good = best is not None and best[0] < _POOR * proposal.skeleton.cost
+            if best is None or (self._first and (good or len(proposal.stops) > _MANY)):
+                break
+        return best
