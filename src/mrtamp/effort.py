@@ -47,12 +47,15 @@ class Effort:
             for name, share in out.items()
         }
 
-    def next(self, available: Sequence[str]) -> str:
+    def next(self, available: Sequence[str], eager: str | None = None) -> str:
         """The one of the available activities that is furthest behind its share of the recent work.
 
-        What is not available leaves its share to the others, up to their ceilings.
+        What is not available leaves its share to the others, up to their ceilings.  What is `eager`, since it is too
+        soon to tell what it gains, has all that the floors of the others leave.
         """
         shares = self.shares()
+        if eager is not None:
+            shares = {**self.floors, eager: 1.0 - sum(self.floors[name] for name in self.floors if name != eager)}
         whole = sum(shares[name] for name in available)
         scaled = {name: min(shares[name] / whole, self.ceilings[name]) for name in available}
         work = sum(self._work[name] for name in available)

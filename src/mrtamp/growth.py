@@ -151,7 +151,7 @@ class Growth:
         )
         if timed is None:
             assert self.insertion.stuck is not None
-            if not varied and not alone:
+            if not varied:
                 skeletons.failed(proposal.stops[self.insertion.stuck][1])
             return None
         return timed if self.is_goal_mode(timed[0][-1].mode) else None

@@ -158,7 +158,7 @@ class Planner:
             drafts=self._uses("drafts"),
         )
         self._effort = Effort(
-            {"search": 0.05, "skeletons": 0.08, "refinement": 0.1},
+            {"search": 0.05, "skeletons": 0.2, "refinement": 0.1},
             {"search": 0.0, "skeletons": 0.1, "refinement": 0.9},
             {"refinement": self.options.refinement_share},
         )
@@ -237,9 +237,11 @@ class Planner:
         if self.best is None:
             return "skeletons" if skeletons and self.iteration % _SKELETON_TURN == 0 else "search"
         refine = self._uses("refinement") and not self.portfolio.idle(self._to_beat())
+        if skeletons and refine and self.realisation.undrafted:
+            return "skeletons"
         skeletons = skeletons and not (refine and self.portfolio.busy)
         available = ["search", *(["skeletons"] if skeletons else []), *(["refinement"] if refine else [])]
-        return self._effort.next(available)
+        return self._effort.next(available, eager="refinement" if refine and self.portfolio.busy else None)
 
     def _uses(self, mechanism: str) -> bool:
         return mechanism not in self.options.without

@@ -10,7 +10,9 @@ import numpy as np
 from mrtamp.collision import RESOLUTION, Collision
 from mrtamp.incumbent import Incumbent
 from mrtamp.optimise import Optimiser
-from mrtamp.plan import Plan, Segment, Transition
+from mrtamp.optimise.nearness import Nearness
+from mrtamp.optimise.yielding import Draft, Yielding
+from mrtamp.plan import Plan, Transition
 from mrtamp.problem import Problem
 from mrtamp.refine import Refiner
 from mrtamp.roadmap import Roadmap
@@ -115,6 +117,8 @@ class Portfolio:
         self._entries: list[_Entry] = []
         self._settled: list[Plan] = []
         self._seen: set[float] = set()
+        self._nearness = Nearness(collision)
+        self.yielding = Yielding(problem, self._nearness)
 
     def add(self, plan: Plan) -> bool:
         """Put a checked plan under refinement; False if one like it is or was.
@@ -135,23 +139,23 @@ class Portfolio:
         """Whether a plan with the same order of events is under refinement."""
         return any(_order(e.plan.transitions) == _order(transitions) for e in self._entries)
 
-    def add_drafts(self, drafts: Sequence[tuple[list[Segment], list[Transition]]], most: int) -> int:
-        """Put motions that are free of collision but for that of robots with each other under convex programming.
+    def add_drafts(self, drafts: Sequence[Draft]) -> int:
+        """Put motions in which robots still collide with each other under convex programming; how many are new.
 
-        Of all drafts those are kept, up to `most`, that promise most: cheap, and not deep in collision.
+        The first is worked on first: among those on trial the newest goes on.
         """
-        entries = []
-        for segments, transitions in drafts:
-            plan = self.incumbent.plan(segments, transitions)
-            if round(plan.cost, 6) not in self._seen:
-                self._seen.add(round(plan.cost, 6))
-                entry = _Entry(plan, draft=True)
-                entry.optimiser = self._optimiser(entry)
-                entries.append((entry.optimiser.merit, entry))
-        # The most promising goes first: among those on trial the newest does.
-        kept = [entry for _, entry in sorted(entries, key=lambda x: x[0])][:most][::-1]
-        self._entries += kept
-        return len(kept)
+        fresh = []
+        for draft in drafts:
+            plan = self.incumbent.plan(draft.segments, draft.transitions)
+            if round(plan.cost, 6) in self._seen:
+                continue
+            self._seen.add(round(plan.cost, 6))
+            free = self.incumbent.accepted(draft.segments, draft.transitions) if draft.conflict == 0.0 else None
+            entry = _Entry(free or plan, draft=free is None)
+            entry.optimiser = self._optimiser(entry)
+            fresh.append(entry)
+        self._entries += fresh[::-1]
+        return len(fresh)
 
     def improve(self, incumbent: float) -> Plan | None:
         """Give one plan its turn; a checked plan when it is clearly cheaper than `incumbent`."""
@@ -227,7 +231,7 @@ class Portfolio:
     def _optimiser(self, entry: _Entry) -> Optimiser:
         return Optimiser(
             self.problem,
-            self.collision,
+            self._nearness,
             entry.plan.segments,
             entry.plan.transitions,
             self.sampler.families,
@@ -279,16 +283,7 @@ class Portfolio:
         return None
 
     def _refiner(self, entry: _Entry) -> Refiner:
-        return Refiner(
-            entry.plan.segments,
-            entry.plan.transitions,
-            self.problem.cost,
-            self.collision,
-            self.validity,
-            self.roadmaps,
-            self.rng,
-            entry.resolution,
-        )
+        return Refiner.of_plan(entry.plan, self.validity, self.rng, entry.resolution)
 
 
 def _order(transitions: Sequence[Transition]) -> tuple:

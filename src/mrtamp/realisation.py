@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 from mrtamp.growth import Growth, Timed
 from mrtamp.incumbent import Incumbent
+from mrtamp.optimise.yielding import Draft
 from mrtamp.plan import Plan, plan_cost
 from mrtamp.portfolio import Portfolio
 from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
@@ -24,8 +25,14 @@ _QUICK, _THOROUGH = 30, 300
 """Orders evaluated per search for skeletons, before there is a plan and later."""
 _RIVALS, _INSERTIONS = 2, 3
 """Skeletons of which the cheapest is refined, and realisations of each that are compared."""
-_SKETCHED, _DRAFTS = 4, 3
+_SKETCHED, _DRAFTS = 16, 3
 """Skeletons that are drafted at a time, and drafts of them that are refined."""
+_AT_ONCE = 4
+"""Skeletons that are drafted before what was learnt from them changes what is proposed."""
+_DETERRENT = 2.0
+"""By how much dearer a skeleton seems for a conflict of 1 in its draft."""
+_CONFLICT = 0.065
+"""Conflict (m of penetration times rad of motion) of a draft from which on it hardly ever comes free."""
 _POOR = 2.0
 """A first realisation that costs so many times what its skeleton promised is not the only one."""
 _MANY = 12
@@ -43,6 +50,10 @@ class Realisation:
     root : the tree's root, where every skeleton starts.
     to_beat : cost that a skeleton has to promise less than.
     drafts : whether skeletons are also put under refinement as they are.
+
+    Attributes
+    ----------
+    undrafted : whether drafts are still to be made for the first time: the sooner the better, once there is a plan.
     """
 
     def __init__(
@@ -62,8 +73,9 @@ class Realisation:
         self.portfolio = portfolio
         self.root = root
         self.to_beat = to_beat
-        self.drafts = drafts
-        self._drafting = False
+        self.drafts = drafts and portfolio.convex
+        self.undrafted = self.drafts
+        self._turn = 0
 
     def attempt(self) -> Plan | Node | None:
         """Grow the sets of ways and realise the cheapest skeletons that may beat the incumbent, until one succeeds.
@@ -75,7 +87,7 @@ class Realisation:
         first = self._first
         self.skeletons.grow(*(_FIRST_WAYS if first else _MORE_WAYS))
         self.skeletons.update_bound()
-        if not first and self.drafts and self.portfolio.convex and self._draft():
+        if not first and self.drafts and self._draft():
             return None
         tries = 0
         while tries < _REALISATIONS:
@@ -115,20 +127,40 @@ class Realisation:
         return self.incumbent.best is None
 
     def _draft(self) -> bool:
-        """Every other time, put the cheapest skeletons under refinement as they are; whether there was a new one.
+        """Two times out of three, put some cheap skeletons under refinement as they are; whether there was a new one.
 
-        Each robot is scheduled as if it were alone: where the others let it pass after some pushing and pulling, that
-        costs little more than the skeleton promised.
+        Each robot goes its way as if it were alone, and only the timing makes them yield to one another.  Where that
+        leaves little conflict, convex programs pull them apart at hardly more than the skeleton promised.
         """
-        self._drafting = not self._drafting
-        if not self._drafting:
+        self._turn += 1
+        if self._turn % 3 == 0:
             return False
-        drafts = []
-        for proposal in itertools.islice(self.skeletons.propose(self.to_beat(), _THOROUGH), _SKETCHED):
-            self.skeletons.realised(proposal)
-            timed = self.growth.insert(proposal, self.skeletons, self.root, alone=True)
-            drafts += [timed] if timed is not None else []
-        return self.portfolio.add_drafts(drafts, _DRAFTS) > 0
+        self.undrafted = False
+        drafts: list[tuple[float, Draft]] = []
+        sketched = 0
+        while sketched < _SKETCHED and len(drafts) < _DRAFTS:
+            proposals = list(itertools.islice(self.skeletons.propose(self.to_beat(), _THOROUGH), _AT_ONCE))
+            if not proposals:
+                break
+            for proposal in proposals:
+                sketched += 1
+                draft = self._sketch(proposal)
+                if draft is not None:
+                    drafts.append((proposal.skeleton.cost * (1 + _DETERRENT * draft.conflict), draft))
+        drafts.sort(key=lambda x: x[0])
+        return self.portfolio.add_drafts([draft for _, draft in drafts[:_DRAFTS]]) > 0
+
+    def _sketch(self, proposal: Proposal) -> Draft | None:
+        """The draft of a skeleton; None where there is too much conflict, which then counts against its ways."""
+        self.skeletons.realised(proposal)
+        timed = self.growth.insert(proposal, self.skeletons, self.root, alone=True)
+        if timed is None:
+            return None
+        draft = self.portfolio.yielding.time(*timed)
+        if draft.conflict < _CONFLICT:
+            return draft
+        self.skeletons.crowded(proposal, draft.conflict)
+        return None
 
     def _cheapest_insertion(self, proposal: Proposal) -> tuple[float, Timed] | None:
         """The cheapest of several realisations of a skeleton in space and time, with its cost; None if the first fails.

@@ -25,6 +25,8 @@ from mrtamp.transitions.candidate import Candidate
 from mrtamp.transitions.sampler import TransitionSampler
 from mrtamp.transitions.ways import Stop, Way, Ways
 
+_CROWDED = 3.0
+"""Added to the estimated cost of a way (rad) for a conflict of 1 (see `mrtamp.optimise.yielding.Draft`)."""
 _FAILED = 2.0
 """Added to the estimated cost of a way (rad) whose stop could not be realised."""
 _REPEATED = 0.04
@@ -277,6 +279,12 @@ class SkeletonGuidance:
         """A stop of this way could not be reached, or its transition could not happen."""
         way.failures += 1
         way.penalty += _FAILED
+
+    def crowded(self, proposal: Proposal, conflict: float) -> None:
+        """Robots would collide a lot on these ways; whose ways are to blame is left to chance."""
+        for way in {id(way): way for _, way in proposal.stops}.values():
+            if self.rng.random() < 0.5:
+                way.penalty += _CROWDED * conflict
 
     def realised(self, proposal: Proposal) -> None:
         """A proposal became a plan; others get their turn, and this order again when it still seems cheapest."""

@@ -17,6 +17,7 @@ import mrtamp
 from mrtamp.check import Checker
 from mrtamp.check_report import Report, Side, Violation
 from mrtamp.optimise import Optimiser
+from mrtamp.optimise.nearness import Nearness
 from mrtamp.plan import Plan, plan_cost
 from mrtamp.planner import Planner
 from mrtamp.problem import AtConfiguration, CostWeights, HandAt, HandIn, Problem, RobotAt, Shape, StaticBody, Subgoal
@@ -193,7 +194,8 @@ def test_a_confirmed_result_is_not_given_up(tmp_path: Path) -> None:
 def test_two_arms() -> None:
     planner = Planner(mrtamp.load_problem("pick_place", robots=2, objects=2), seed=0)
     plan = next(planner.improve(30, first=True))
-    scp = Optimiser(planner.problem, planner.collision, plan.segments, plan.transitions, planner.sampler.families)
+    nearness = Nearness(planner.collision)
+    scp = Optimiser(planner.problem, nearness, plan.segments, plan.transitions, planner.sampler.families)
     costs = run(scp, 15)
     assert costs[-1] < 0.98 * costs[0]
     report = judged(scp)
@@ -217,7 +219,7 @@ def crossing(folder: Path) -> Plan:
 def test_a_draft_is_pulled_apart(tmp_path: Path) -> None:
     plan = crossing(tmp_path)
     scp = optimiser(plan, draft=True)
-    assert scp.cost == np.inf and scp.outlook < np.inf and scp.merit > plan.cost
+    assert scp.cost == np.inf and scp.outlook < np.inf
     for _ in range(30):
         scp.step()
         if np.isfinite(scp.cost):

@@ -29,7 +29,7 @@ def optimiser(plan: Plan, **keys) -> Optimiser:
         for r in problem.robots
         for o in problem.objects
     }
-    return Optimiser(problem, Collision(problem), plan.segments, plan.transitions, families, **keys)
+    return Optimiser(problem, Nearness(Collision(problem)), plan.segments, plan.transitions, families, **keys)
 
 
 def rows(scp: Optimiser) -> CollisionRows:

@@ -14,7 +14,6 @@ import numpy as np
 from scipy import sparse
 
 from mrtamp.check_report import Report, Violation
-from mrtamp.collision import Collision
 from mrtamp.optimise.choices import Arrangement, Choices
 from mrtamp.optimise.closure import Closure, Rows, independent
 from mrtamp.optimise.collisions import CollisionRows, Collisions
@@ -68,6 +67,7 @@ class Optimiser:
 
     Parameters
     ----------
+    nearness : measures distances in the problem's plants; may be shared by optimisers of the same problem.
     segments, transitions : a valid plan.
     families : (robot, object) -> grasp families within which grasps may slide.
     knot : length (rad) of the steps of the polyline.
@@ -86,7 +86,7 @@ class Optimiser:
     def __init__(
         self,
         problem: Problem,
-        collision: Collision,
+        nearness: Nearness,
         segments: Sequence[Segment],
         transitions: Sequence[Transition],
         families: Mapping[tuple[str, str], Sequence[GraspFamily]],
@@ -98,8 +98,8 @@ class Optimiser:
     ) -> None:
         self.problem = problem
         self.weights = problem.cost
-        self.worlds = collision.worlds
-        self.nearness = Nearness(collision)
+        self.worlds = nearness.worlds
+        self.nearness = nearness
         self.fine = FineCheck(self.nearness)
         self.knot = knot
         self.levels = levels
@@ -198,17 +198,10 @@ class Optimiser:
         self._adopt(iterate)
 
     @property
-    def merit(self) -> float:
-        """Cost of the current iterate with what its penetrations are charged."""
-        if self._rows is None:
-            self._rows = self.collisions.rows(self._now.line, self._now.q, self._now.arrangement)
-        return self._merit(self._now, self._rows)
-
-    @property
     def stuck(self) -> bool:
         """Whether a draft has not come out of collision and does not get any further."""
         depths = self._depths[-_LINGER:]
-        return np.isinf(self.cost) and len(depths) == _LINGER and depths[-1] > max(_LODGED, _YIELDS * depths[0])
+        return np.isinf(self.cost) and len(depths) == _LINGER and depths[-1] > max(_LODGED, _YIELDS * max(depths))
 
     # -- one step ---------------------------------------------------------------------------------------------------
 

@@ -189,27 +189,57 @@ class TransitionSampler(Workspace):
         """Sample handovers of what `giver` holds to `receiver`; returns the new candidates."""
         grasp = mode.held[giver]
         item = grasp.object
-        strata = self.strata(mode, "handover", (giver, receiver), item)
         stats = self.outcome(("handover", (giver, receiver), item, giver))
         stats.calls += 1
-        if not strata:
+        if not self.strata(mode, "handover", (giver, receiver), item):
             return []
         self.meetings.grow_pool(mode, receiver, item)
         qa, grasps = self.meetings.propose(giver, receiver, grasp, n)
         if not len(qa):
             return []
-        stats.samples += len(qa)
-        X_WO = self.roadmaps[giver].world.tool.matrix(qa) @ grasp.X_PO
-        X_OG = inverse(np.array([g.X_PO for g in grasps]))
+        X_WG = self._received(giver, grasp, qa, grasps)
         # Most meeting places are near the edge of both arms' reach: several seeds each.
-        X_WG = np.repeat(X_WO @ X_OG, _SEEDS, axis=0)
+        X_WG = np.repeat(X_WG, _SEEDS, axis=0)
         found, each = (x.reshape(len(qa), _SEEDS, -1) for x in self.ik(receiver, X_WG, self.seeds(receiver, X_WG, 0.6)))
-        solved = each[:, :, 0].any(axis=1)
+        solved = np.asarray(each[:, :, 0].any(axis=1))
         qb = found[np.arange(len(qa)), np.argmax(each[:, :, 0], axis=1)]
+        return self._exchanges(mode, giver, receiver, grasps, qa, qb, solved, keep)
+
+    def vary_handover(
+        self, mode: Mode, giver: str, receiver: str, taken: Attachment, qa: np.ndarray, qb: np.ndarray, keep: int = 3
+    ) -> list[Candidate]:
+        """Handovers into a known grasp with the giver at qa (N, n) and the receiver near qb (N, m); the new ones."""
+        stats = self.outcome(("handover", (giver, receiver), taken.object, giver))
+        stats.calls += 1
+        grasps = [taken] * len(qa)
+        q, solved = self.ik(receiver, self._received(giver, mode.held[giver], qa, grasps), qb)
+        return self._exchanges(mode, giver, receiver, grasps, qa, q, solved, keep)
+
+    def _received(self, giver: str, grasp: Attachment, qa: np.ndarray, grasps: Sequence[Attachment]) -> np.ndarray:
+        """Poses X_WG (N, 4, 4) of the receiver's hand for each of its grasps, with the giver at qa (N, n)."""
+        X_WO = self.roadmaps[giver].world.tool.matrix(qa) @ grasp.X_PO
+        return X_WO @ inverse(np.array([g.X_PO for g in grasps]))
+
+    def _exchanges(
+        self,
+        mode: Mode,
+        giver: str,
+        receiver: str,
+        grasps: Sequence[Attachment],
+        qa: np.ndarray,
+        qb: np.ndarray,
+        solved: np.ndarray,
+        keep: int,
+    ) -> list[Candidate]:
+        """Candidates of those solved handovers that are free of collision, up to `keep`."""
+        grasp = mode.held[giver]
+        item = grasp.object
+        stats = self.outcome(("handover", (giver, receiver), item, giver))
+        stats.samples += len(qa)
         stats.ik_solved += int(solved.sum())
         rows = np.flatnonzero(solved)
-        grasps = [grasps[i] for i in rows]
-        reward = self.look_ahead(mode, receiver, item, grasps, qb[rows])
+        into = [grasps[i] for i in rows.tolist()]
+        reward = self.look_ahead(mode, receiver, item, into, qb[rows])
         homes = [self.roadmaps[r].world.home for r in (giver, receiver)]
         near = np.linalg.norm(qa[rows] - homes[0], axis=1) + np.linalg.norm(qb[rows] - homes[1], axis=1)
         out: list[Candidate] = []
@@ -219,10 +249,10 @@ class TransitionSampler(Workspace):
         order = self.mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON))
         # Of those that cannot be put down where they belong afterwards, a few are enough.
         order = np.concatenate([order[promising[order]][: 4 * keep], order[~promising[order]][:2]])
-        for k in order:
-            at = self.contacts.exchange(mode, giver, receiver, grasp, grasps[k], qa[rows[k]], qb[rows[k]], stats)
+        for k in order.tolist():
+            at = self.contacts.exchange(mode, giver, receiver, grasp, into[k], qa[rows[k]], qb[rows[k]], stats)
             if at is not None:
-                candidate = Candidate("handover", (giver, receiver), at, grasp, grasps[k], promising=bool(promising[k]))
+                candidate = Candidate("handover", (giver, receiver), at, grasp, into[k], promising=bool(promising[k]))
                 self._handovers.setdefault((grasp, receiver), []).append(candidate)
                 out.append(candidate)
                 stats.accepted += 1

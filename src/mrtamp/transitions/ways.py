@@ -24,6 +24,10 @@ _PLACES = 3
 """Places drawn per grasp."""
 _AFTER = 24
 """Places drawn after a handover: those are dear, so each is followed up."""
+_BEST, _VARIED = 10, 5
+"""Of the shortest ways with a handover so many, drawn at random, are varied each time more are sampled."""
+_INWARD, _SPREAD = 0.6, 0.2
+"""Variations of a handover lie up to that share of the way nearer to its robots' other stops, give or take (rad)."""
 _CHECKED = 0.6
 """Share of the solved ways, shortest first for the most part, that are checked for collisions."""
 BLOCKED = 1.5
@@ -199,31 +203,65 @@ class Ways:
         places = self._goal_places(mode, item, chains)
         if not places or not self._near(receiver, places) or not sampler.in_reach(giver, start):
             return []
-        picks = sampler.picks(mode, giver, item) or sampler.sample_pick(mode, giver, item, n)
+        picks = sampler.picks(mode, giver, item) if self.tries[key] == 1 else []
+        picks = picks or sampler.sample_pick(mode, giver, item, n) or sampler.picks(mode, giver, item)
         picks = [p for p in picks if p.promising] or picks
         out: list[Way] = []
         for pick in [picks[int(i)] for i in self.rng.permutation(len(picks))[:2]]:
             held = mode.replace(*([pick.after] if pick.after else []))
-            for handover in sampler.sample_handover(held, giver, receiver, n):
-                assert handover.after is not None
-                taken = handover.after
-                qb = sampler.roadmaps[receiver].q[handover.at[receiver]]
-                m = _AFTER
-                q2, which, poses, solved = self._places(receiver, [taken] * m, np.tile(qb, (m, 1)), places)
-                found = 0
-                for k in np.flatnonzero(solved)[np.argsort(np.linalg.norm(q2[solved] - qb, axis=1))].tolist():
-                    after = self._attachment(item, places[which[k]], poses[k])
-                    penalty = self._place_free(mode, receiver, taken, after, places[which[k]].chain, q2[k])
-                    if not np.isfinite(penalty):
-                        continue
-                    place = Stop("place", (receiver,), taken, after, {receiver: q2[k]})
-                    out.append(Way((stop_of(pick, sampler), stop_of(handover, sampler), place), BLOCKED * penalty))
-                    found += 1
-                    if found == 2:
-                        break
+            out += self._followed_up(mode, pick, sampler.sample_handover(held, giver, receiver, n), places)
             if len(out) >= keep:
                 break
+        if self.tries[key] > 1:
+            shortest: dict[tuple[Attachment | None, ...], Way] = {}
+            for way in sorted(self.of.get(key, ()), key=self._length):
+                shortest.setdefault(tuple(stop.after for stop in way.stops[:2]), way)
+            best = [*shortest.values()][:_BEST]
+            for way in [best[int(i)] for i in self.rng.permutation(len(best))[:_VARIED]]:
+                out += self._varied(mode, way, n, places)
         self._keep(key, out)
+        return out
+
+    def _varied(self, mode: Mode, way: Way, n: int, places: list[_Place]) -> list[Way]:
+        """Ways with the grasps of a given one whose handovers lie nearer to where their robots come from and go to.
+
+        A handover has so many dimensions that uniform samples alone hardly come near a short one.
+        """
+        pick, handover, place = way.stops
+        giver, receiver = handover.robots
+        assert pick.candidate is not None and pick.after is not None and handover.after is not None
+        near = []
+        for r, other in ((giver, pick.q[giver]), (receiver, place.q[receiver])):
+            q, chain = handover.q[r], self.sampler.roadmaps[r].world.chain
+            inward = self.rng.uniform(0, _INWARD, (n, 1)) * ((self._home(r) + other) / 2 - q)
+            near.append(
+                np.clip(q + inward + self.rng.normal(scale=_SPREAD, size=(n, len(q))), chain.lower, chain.upper)
+            )
+        held = mode.replace(pick.after)
+        found = self.sampler.vary_handover(held, giver, receiver, handover.after, near[0], near[1])
+        return self._followed_up(mode, pick.candidate, found, places)
+
+    def _followed_up(self, mode: Mode, pick: Candidate, handovers: list[Candidate], places: list[_Place]) -> list[Way]:
+        """Ways from a pick through each of the handovers to up to two places."""
+        sampler = self.sampler
+        out: list[Way] = []
+        for handover in handovers:
+            assert handover.after is not None
+            taken, receiver = handover.after, handover.robots[-1]
+            qb = sampler.roadmaps[receiver].q[handover.at[receiver]]
+            m = _AFTER
+            q2, which, poses, solved = self._places(receiver, [taken] * m, np.tile(qb, (m, 1)), places)
+            found = 0
+            for k in np.flatnonzero(solved)[np.argsort(np.linalg.norm(q2[solved] - qb, axis=1))].tolist():
+                after = self._attachment(taken.object, places[which[k]], poses[k])
+                penalty = self._place_free(mode, receiver, taken, after, places[which[k]].chain, q2[k])
+                if not np.isfinite(penalty):
+                    continue
+                place = Stop("place", (receiver,), taken, after, {receiver: q2[k]})
+                out.append(Way((stop_of(pick, sampler), stop_of(handover, sampler), place), BLOCKED * penalty))
+                found += 1
+                if found == 2:
+                    break
         return out
 
     def _keep(self, key: tuple[str, tuple[str, ...]], ways: list[Way], most: int = 160) -> None:

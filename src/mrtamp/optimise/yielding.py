@@ -1,0 +1,349 @@
+"""Timing drafts: which robot is how far along its way when, with penetrations charged instead of forbidden.
+
+Every robot keeps its way and the order of its own events; what is chosen is who goes first where ways cross.  One robot
+after the other is timed against those before it by a cheapest path through their coordination space: how far along
+these are by how far along it is, with the depth of penetration charged along the motion.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from mrtamp.modes import Attachment, Mode, object_poses
+from mrtamp.optimise.nearness import Nearness, Samples, State
+from mrtamp.plan import Segment, Transition
+from mrtamp.problem import WORLD, Problem
+
+_STEP = 0.3
+"""Longest step (rad or m) of a robot along its way."""
+_CHARGE = (10.0, 300.0)
+"""By how many times motion at a penetration of 1 m seems longer than it is: linear and quadratic in the depth."""
+_NEVER = 1e6
+"""What it costs to do something too early."""
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """Motions that may still collide: `conflict` is the depth of penetration (m) summed along the motion (rad or m)."""
+
+    segments: list[Segment]
+    transitions: list[Transition]
+    conflict: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Course:
+    """The way of one robot.
+
+    q : nodes (M, n); there are two for every event, one before and one after it.
+    step : length (M,) of the step that leads to each node.
+    stage : number (M,) of the robot's own events up to each node.
+    held : what the robot holds after each number of events.
+    done : event -> the first node after it.
+    state : its bodies and its load at the nodes.
+    """
+
+    q: np.ndarray
+    step: np.ndarray
+    stage: np.ndarray
+    held: list[Attachment | None]
+    done: dict[int, int]
+    state: State
+
+
+@dataclass(frozen=True, eq=False)
+class _Rest:
+    """An object that rests at X_WO from event `since` (None: the start) until event `until` (None: the end)."""
+
+    at: Attachment
+    X_WO: np.ndarray
+    since: int | None
+    until: int | None
+
+
+class _Situations:
+    """Modes of which only a part matters, and where objects rest in them."""
+
+    def __init__(self) -> None:
+        self.modes: list[Mode] = []
+        self._resting: dict[Mode, Mapping[str, np.ndarray]] = {}
+
+    def add(self, attachments: Sequence[Attachment | None], resting: Mapping[str, np.ndarray]) -> None:
+        mode = Mode(tuple(a for a in attachments if a is not None))
+        self.modes.append(mode)
+        self._resting[mode] = resting
+
+    def resting(self, mode: Mode) -> Mapping[str, np.ndarray]:
+        return self._resting[mode]
+
+
+class Yielding:
+    """Times drafts of one problem.
+
+    Parameters
+    ----------
+    nearness : measures how deep solids of the problem's plants penetrate.
+    """
+
+    def __init__(self, problem: Problem, nearness: Nearness) -> None:
+        self.problem = problem
+        self.nearness = nearness
+        # Poses of what is held are of no interest.
+        nowhere = dict.fromkeys(nearness.worlds, np.eye(4))
+        self._X_WP = {WORLD: np.eye(4), **{s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}, **nowhere}
+        self._radius = {o: r for w in nearness.worlds.values() for o, r in w.object_radius.items()}
+
+    def time(self, segments: Sequence[Segment], transitions: Sequence[Transition]) -> Draft:
+        """The same ways timed anew; events of different robots change places where nothing speaks against it."""
+        courses = {r: self._course(r, segments, transitions) for r in segments[0].q}
+        rests = self._rests([s.mode for s in segments])
+        before = self._precedence(transitions, rests)
+        names = sorted(courses, key=lambda r: -courses[r].step.sum())
+        nodes = {names[0]: np.arange(len(courses[names[0]].q))}
+        conflict = 0.0
+        for name in names[1:]:
+            nodes, more = self._join(courses, nodes, name, rests, before)
+            conflict += more
+        return Draft(*_timed(segments[0].mode, transitions, courses, nodes), conflict)
+
+    # -- ways and what stands in them -------------------------------------------------------------------------------
+
+    def _course(self, robot: str, segments: Sequence[Segment], transitions: Sequence[Transition]) -> _Course:
+        q, stage = [segments[0].q[robot][0]], [0]
+        held, done = [segments[0].mode.held.get(robot)], {}
+        for k, segment in enumerate(segments):
+            for x in segment.q[robot][1:]:
+                last = q[-1]
+                way = float(np.linalg.norm(x - last))
+                if way > 0:
+                    n = max(1, int(np.ceil(way / _STEP - 1e-9)))
+                    q += [*(last + (x - last) * (j / n) for j in range(1, n)), x]
+                    stage += n * [len(held) - 1]
+            if k < len(transitions) and robot in transitions[k].active:
+                done[k] = len(q)
+                held.append(segments[k + 1].mode.held.get(robot))
+                q.append(q[-1])
+                stage.append(len(held) - 1)
+        nodes, stages = np.array(q), np.array(stage)
+        step = np.concatenate([[0.0], np.linalg.norm(np.diff(nodes, axis=0), axis=1)])
+        samples = Samples(np.arange(len(nodes)), np.zeros(len(nodes)), stages)
+        holding = _Situations()
+        for a in held:
+            holding.add([a], {})
+        state = self.nearness.state(robot, nodes, samples, holding.modes)
+        return _Course(nodes, step, stages, held, done, state)
+
+    def _rests(self, modes: Sequence[Mode]) -> list[_Rest]:
+        """Where objects rest that do not rest there all the time."""
+        poses = [object_poses(mode, self._X_WP) for mode in modes]
+        out = []
+        for name in modes[0].of:
+            runs = [list(run) for _, run in itertools.groupby(range(len(modes)), key=lambda k: modes[k].of[name])]
+            if len(runs) == 1:
+                continue
+            for run in runs:
+                a = modes[run[0]].of[name]
+                if not a.held:
+                    since = run[0] - 1 if run[0] else None
+                    out.append(_Rest(a, poses[run[0]][name], since, run[-1] if run[-1] < len(modes) - 1 else None))
+        return out
+
+    def _precedence(self, transitions: Sequence[Transition], rests: Sequence[_Rest]) -> dict[int, set[int]]:
+        """Event -> earlier ones that have to stay earlier; what one robot does one after the other is not listed.
+
+        Those with the same object, those with what an object lies on, subgoals that come after others, and leaving a
+        place before something else is put there.
+        """
+        after = {s.name: set(s.after) for s in self.problem.subgoals}
+        about = []
+        for t in transitions:
+            attached = [x for a in t.actions for x in (a.before, a.after) if x is not None]
+            about.append({x.object for x in attached} | {x.parent for x in attached if x.parent in self._radius})
+        out: dict[int, set[int]] = {k: set() for k in range(len(transitions))}
+        for j, k in itertools.combinations(range(len(transitions)), 2):
+            waits = {s for a in transitions[k].actions if a.subgoal is not None for s in after[a.subgoal]}
+            if about[j] & about[k] or waits & {a.subgoal for a in transitions[j].actions}:
+                out[k].add(j)
+        for x, y in itertools.permutations(rests, 2):
+            if x.until is not None and y.since is not None and x.until < y.since:
+                gap = np.linalg.norm(x.X_WO[:3, 3] - y.X_WO[:3, 3])
+                if gap < self._radius[x.at.object] + self._radius[y.at.object]:
+                    out[y.since].add(x.until)
+        return out
+
+    # -- coordination space -----------------------------------------------------------------------------------------
+
+    def _join(
+        self,
+        courses: Mapping[str, _Course],
+        nodes: Mapping[str, np.ndarray],
+        robot: str,
+        rests: Sequence[_Rest],
+        before: Mapping[int, set[int]],
+    ) -> tuple[dict[str, np.ndarray], float]:
+        """Nodes (T',) of all robots at instants, and their conflict, once `robot` is timed against those in `nodes`."""
+        course = courses[robot]
+        instants = len(next(iter(nodes.values())))
+        depth = np.zeros((instants, len(course.q)))
+        done = {k: int(np.argmax(nodes[r] >= node)) for r in nodes for k, node in courses[r].done.items()}
+        for other, at in nodes.items():
+            used, inverse = np.unique(at, return_inverse=True)
+            depth += self._depths(other, courses[other], used, robot, course)[inverse]
+        for name in [robot, *nodes]:
+            depth += self._depths_at_rests(courses, nodes, name, robot, rests, done)
+        never = np.zeros(depth.shape, dtype=bool)
+        for k, node in course.done.items():
+            for t in [done[j] for j in (*before[k], k) if j in done]:
+                never[:t, node:] = True
+        for k, t in done.items():
+            for j in (*before[k], k):
+                if j in course.done and (j == k or k not in course.done):
+                    never[t:, : course.done[j]] = True
+        step = np.zeros(instants)
+        for r, at in nodes.items():
+            step = np.maximum(step, np.where(np.diff(at, prepend=0) > 0, courses[r].step[at], 0.0))
+        row, column, conflict = _cheapest(step, course.step, depth, never)
+        return {**{r: at[row] for r, at in nodes.items()}, robot: column}, conflict
+
+    def _depths(self, one: str, a: _Course, used: np.ndarray, two: str, b: _Course) -> np.ndarray:
+        """Deepest penetration (U, N) of robot one at its nodes `used` (U,) and robot two at all of its nodes."""
+        out = np.zeros((len(used), len(b.q)))
+        U, N = _overlapping(a.state.of(used), b.state)
+        if not len(U):
+            return out
+        states = a.state.of(used[U]), b.state.of(N)
+        situations = _Situations()
+        for x, y in itertools.product(a.held, b.held):
+            situations.add([x, y], {})
+        of = a.stage[used[U]] * len(b.held) + b.stage[N]
+        samples = Samples(np.arange(len(U)), np.zeros(len(U)), of)
+        near = self.nearness.between((one, two), states, samples, situations, 0.0)
+        found = np.zeros(len(U))
+        np.maximum.at(found, near.sample, -near.distance - near.padding)
+        out[U, N] = found
+        return out
+
+    def _depths_at_rests(
+        self,
+        courses: Mapping[str, _Course],
+        nodes: Mapping[str, np.ndarray],
+        name: str,
+        robot: str,
+        rests: Sequence[_Rest],
+        done: Mapping[int, int],
+    ) -> np.ndarray:
+        """Penetration (T, N) of robot `name` and objects at rest, as far as it depends on when `robot` does what.
+
+        `done` tells when the others' events happen.  What depends on robots that are timed later is charged then.
+        """
+        mine, course = courses[robot], courses[name]
+        instants = len(next(iter(nodes.values())))
+        out = np.zeros((instants, len(mine.q)))
+        for rest in rests:
+            events = {k for k in (rest.since, rest.until) if k is not None}
+            if not events <= {*done, *mine.done} or events <= set(course.done):
+                continue
+            if name != robot and not events & set(mine.done):
+                continue
+            there = np.ones(out.shape, dtype=bool)
+            for k, present in ((rest.since, True), (rest.until, False)):
+                if k is not None:
+                    over = np.zeros(out.shape, dtype=bool)
+                    over[done.get(k, instants) :] = True
+                    over[:, mine.done.get(k, len(mine.q)) :] = True
+                    there &= over == present
+            depth = self._depth_at(name, course, rest)
+            out += there * (depth[None] if name == robot else depth[nodes[name]][:, None])
+        return out
+
+    def _depth_at(self, robot: str, course: _Course, rest: _Rest) -> np.ndarray:
+        """Deepest penetration (M,) of a robot at its nodes and an object where it rests."""
+        out = np.zeros(len(course.q))
+        item = rest.at.object
+        gap = np.linalg.norm(course.state.centres - rest.X_WO[:3, 3], axis=2) - course.state.radii
+        holds = np.array([a is not None and a.object == item for a in course.held])[course.stage]
+        close = np.flatnonzero((gap.min(axis=1) < self._radius[item]) & ~holds)
+        if not len(close):
+            return out
+        situations = _Situations()
+        for a in course.held:
+            situations.add([a], {item: rest.X_WO})
+        samples = Samples(close, np.zeros(len(close)), course.stage[close])
+        near = self.nearness.world(robot, course.state.of(close), samples, situations, 0.0)
+        number = self.nearness.carriers.number["object", item]
+        about = (near.a == number) | (near.b == number)
+        found = np.zeros(len(close))
+        np.maximum.at(found, near.sample[about], -(near.distance + near.padding)[about])
+        out[close] = found
+        return out
+
+
+def _overlapping(a: State, b: State) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (P,), (P,) of samples of two robots at which bounding spheres meet."""
+    out = np.zeros((len(a.x), len(b.x)), dtype=bool)
+    for i, j in itertools.product(range(a.centres.shape[1]), range(b.centres.shape[1])):
+        limit = a.radii[:, i, None] + b.radii[None, :, j]
+        if limit.max() > 0:
+            out |= cdist(a.centres[:, i], b.centres[:, j]) < limit
+    row, column = np.nonzero(out)
+    return row, column
+
+
+def _cheapest(
+    rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, never: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """A cheapest monotone path from corner to corner: rows (P,), columns (P,), and the depth summed along it.
+
+    A step of rows (T,) and columns (N,), or of one of them, takes as long as the longer of the two.
+    """
+    charge = 1 + _CHARGE[0] * depth + _CHARGE[1] * depth**2
+    cost = np.full(depth.shape, np.inf)
+    along = np.cumsum(columns * charge + _NEVER * never, axis=1)
+    both = np.maximum(rows[:, None], columns[None]) * charge
+    for t in range(len(rows)):
+        base = np.full(len(columns), np.inf)
+        if t == 0:
+            base[0] = 0.0
+        else:
+            base = cost[t - 1] + rows[t] * charge[t] + _NEVER * never[t]
+            base[1:] = np.minimum(base[1:], cost[t - 1, :-1] + both[t, 1:] + _NEVER * never[t, 1:])
+        cost[t] = along[t] + np.minimum.accumulate(base - along[t])
+    t, n = len(rows) - 1, len(columns) - 1
+    path = [(t, n)]
+    conflict = 0.0
+    while t or n:
+        choices = []
+        if t and n:
+            choices.append((cost[t - 1, n - 1] + both[t, n], t - 1, n - 1))
+        if t:
+            choices.append((cost[t - 1, n] + rows[t] * charge[t, n], t - 1, n))
+        if n:
+            choices.append((cost[t, n - 1] + columns[n] * charge[t, n], t, n - 1))
+        _, u, m = min(choices)
+        conflict += depth[t, n] * max(rows[t] * (t - u), columns[n] * (n - m))
+        t, n = u, m
+        path.append((t, n))
+    row, column = np.array(path[::-1]).T
+    return row, column, float(conflict)
+
+
+def _timed(
+    root: Mode, transitions: Sequence[Transition], courses: Mapping[str, _Course], nodes: Mapping[str, np.ndarray]
+) -> tuple[list[Segment], list[Transition]]:
+    """Segments and transitions of robots that are at the given nodes (T,) of their ways."""
+    when = {k: int(np.argmax(nodes[r] >= node)) for r in courses for k, node in courses[r].done.items()}
+    q = {r: courses[r].q[nodes[r]] for r in courses}
+    segments, order, mode, low = [], sorted(when, key=lambda k: (when[k], k)), root, 0
+    for k in [*order, None]:
+        high = len(next(iter(q.values()))) - 1 if k is None else when[k]
+        moves = [any(np.any(x[i] != x[i - 1]) for x in q.values()) for i in range(low + 1, high + 1)]
+        kept = [low, *(i for i, moved in enumerate(moves, start=low + 1) if moved)]
+        segments.append(Segment(mode, {r: x[kept] for r, x in q.items()}))
+        if k is not None:
+            mode, low = mode.after(transitions[k]), high
+    return segments, [transitions[k] for k in order]
