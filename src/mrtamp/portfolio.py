@@ -53,6 +53,8 @@ class _Entry:
 
     plan: Plan
     draft: bool = False
+    estimate: float = np.nan
+    """What its skeleton was to cost, of a draft."""
     resolution: float = RESOLUTION
     refiner: Refiner | None = None
     optimiser: Optimiser | None = None
@@ -117,6 +119,8 @@ class Portfolio:
         self._entries: list[_Entry] = []
         self._settled: list[Plan] = []
         self._seen: set[float] = set()
+        self._share = 0.0
+        """The least that a draft has cost in the end, relative to its estimate."""
         self._nearness = Nearness(collision)
         self.yielding = Yielding(problem, self._nearness)
 
@@ -139,19 +143,20 @@ class Portfolio:
         """Whether a plan with the same order of events is under refinement."""
         return any(_order(e.plan.transitions) == _order(transitions) for e in self._entries)
 
-    def add_drafts(self, drafts: Sequence[Draft]) -> int:
+    def add_drafts(self, drafts: Sequence[tuple[float, Draft]]) -> int:
         """Put motions in which robots still collide with each other under convex programming; how many are new.
 
-        The first is worked on first: among those on trial the newest goes on.
+        They come with what their skeletons were to cost.  The first is worked on first: among those on trial the newest
+        goes on.
         """
         fresh = []
-        for draft in drafts:
+        for estimate, draft in drafts:
             plan = self.incumbent.plan(draft.segments, draft.transitions)
             if round(plan.cost, 6) in self._seen:
                 continue
             self._seen.add(round(plan.cost, 6))
             free = self.incumbent.accepted(draft.segments, draft.transitions) if draft.conflict == 0.0 else None
-            entry = _Entry(free or plan, draft=free is None)
+            entry = _Entry(free or plan, draft=free is None, estimate=estimate)
             entry.optimiser = self._optimiser(entry)
             fresh.append(entry)
         self._entries += fresh[::-1]
@@ -181,7 +186,12 @@ class Portfolio:
         return all(e.done and (e.fruitless >= _ROUNDS or e.cost >= _HOPELESS * incumbent) for e in self._entries)
 
     def _choose(self, incumbent: float) -> _Entry | None:
-        """One that is about to beat the incumbent, else one on trial, the newest first, else one that goes on."""
+        """One that is about to beat the incumbent, else one on trial, the newest first, else one that goes on.
+
+        Drafts are given up once no draft so far has ended cheap enough for them to matter.
+        """
+        enough = _NEARLY * incumbent
+        self._entries = [e for e in self._entries if not (e.draft and self._share * e.estimate > enough)]
         near = [e for e in self._entries if e.optimiser is not None and e.outlook < _NEARLY * incumbent]
         if near:
             return min(near, key=lambda e: e.outlook)
@@ -251,6 +261,10 @@ class Portfolio:
         if entry.draft:
             self._entries.remove(entry)
             return
+        if np.isfinite(entry.estimate):
+            share = entry.plan.cost / entry.estimate
+            self._share = min(self._share or share, share)
+            entry.estimate = np.nan
         gained = entry.before - entry.plan.cost > WORTH_CHECKING * entry.plan.cost
         entry.fruitless = 0 if gained else entry.fruitless + 1
         entry.rounds += 1

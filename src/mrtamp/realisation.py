@@ -29,10 +29,10 @@ _SKETCHED, _DRAFTS = 16, 3
 """Skeletons that are drafted at a time, and drafts of them that are refined."""
 _AT_ONCE = 4
 """Skeletons that are drafted before what was learnt from them changes what is proposed."""
-_DETERRENT = 2.0
-"""By how much dearer a skeleton seems for a conflict of 1 in its draft."""
-_CONFLICT = 0.065
-"""Conflict (m of penetration times rad of motion) of a draft from which on it hardly ever comes free."""
+_CONFLICT = 3e-3
+"""Conflict of a draft (see `Draft`) from which on it hardly ever comes free of collision."""
+_DETERRENT = 100.0
+"""By how many times dearer a skeleton seems for a conflict of 1 in its draft."""
 _POOR = 2.0
 """A first realisation that costs so many times what its skeleton promised is not the only one."""
 _MANY = 12
@@ -146,9 +146,9 @@ class Realisation:
                 sketched += 1
                 draft = self._sketch(proposal)
                 if draft is not None:
-                    drafts.append((proposal.skeleton.cost * (1 + _DETERRENT * draft.conflict), draft))
-        drafts.sort(key=lambda x: x[0])
-        return self.portfolio.add_drafts([draft for _, draft in drafts[:_DRAFTS]]) > 0
+                    drafts.append((proposal.skeleton.cost, draft))
+        drafts.sort(key=lambda x: x[0] * (1 + _DETERRENT * x[1].conflict))
+        return self.portfolio.add_drafts(drafts[:_DRAFTS]) > 0
 
     def _sketch(self, proposal: Proposal) -> Draft | None:
         """The draft of a skeleton; None where there is too much conflict, which then counts against its ways."""

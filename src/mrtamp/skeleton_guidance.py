@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mrtamp.deadline import Deadline
 from mrtamp.guidance import ModalGuidance
 from mrtamp.modes import Attachment, Mode
 from mrtamp.plan import Plan
@@ -25,7 +26,7 @@ from mrtamp.transitions.candidate import Candidate
 from mrtamp.transitions.sampler import TransitionSampler
 from mrtamp.transitions.ways import Stop, Way, Ways
 
-_CROWDED = 3.0
+_CROWDED = 100.0
 """Added to the estimated cost of a way (rad) for a conflict of 1 (see `mrtamp.optimise.yielding.Draft`)."""
 _FAILED = 2.0
 """Added to the estimated cost of a way (rad) whose stop could not be realised."""
@@ -68,8 +69,16 @@ class SkeletonGuidance:
         every task has a way.  A lower bound on plans that use these very transitions, nothing more.
     """
 
-    def __init__(self, problem: Problem, sampler: TransitionSampler, guidance: ModalGuidance, root: Mode) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        sampler: TransitionSampler,
+        guidance: ModalGuidance,
+        root: Mode,
+        deadline: Deadline | None = None,
+    ) -> None:
         self.problem = problem
+        self.deadline = deadline or Deadline()
         self.sampler = sampler
         self.guidance = guidance
         self.root = root
@@ -98,7 +107,12 @@ class SkeletonGuidance:
     # -- sampling -------------------------------------------------------------------------------------------------
 
     def grow(self, n: int, keep: int) -> None:
-        """New ways for every task: n IK seeds per robot and object, at most `keep` new ways each."""
+        """New ways for every task: n IK seeds per robot and object, at most `keep` new ways each.
+
+        Raises
+        ------
+        TimeIsUp : the deadline has passed; the ways found until then are kept.
+        """
         chains: dict[str, tuple[Attachment, ...]] = {}
         serve = {s.body for o in self.items for s in self.sampler.goal_supports[o]}
         for body in self.root.of:
@@ -119,12 +133,14 @@ class SkeletonGuidance:
 
     def _grow_carries(self, item: str, chains: Mapping[str, tuple[Attachment, ...]], n: int, keep: int) -> None:
         for robot in self.robots:
+            self.deadline.check()
             if self._worth((item, (robot,))):
                 self.ways.carry(self.root, robot, item, chains, n, keep)
 
     def _grow_handovers(self, item: str, chains: Mapping[str, tuple[Attachment, ...]], n: int, keep: int) -> None:
         for giver in self.robots:
             for receiver in self.robots:
+                self.deadline.check()
                 pair = (giver, receiver)
                 fits = all(self.sampler.families[r, item] for r in pair)
                 if giver != receiver and fits and self._worth((item, pair)):
@@ -250,6 +266,7 @@ class SkeletonGuidance:
         roadmap, validity = self.sampler.roadmaps[robot], self.sampler.validity
         known = self._lengths.get((robot, a, b))
         if known is None or roadmap.n_vertices > _GROWN * known[0]:
+            self.deadline.check()
             roadmap.offer_direct(a, b)
             blocked = validity.blocked(robot, self.root, {})
             path = lazy_path(roadmap, a, b, blocked, lambda e: validity.edge(robot, e, self.root), _ROUNDS)

@@ -35,7 +35,7 @@ _LARGEST, _SMALLEST = 0.5, 0.01
 _DEEP = 0.06
 """Penetration (m) at which a step is rejected."""
 _LINGER, _LODGED, _YIELDS = 5, 0.004, 0.8
-"""Steps in which a draft whose robots penetrate by more than that (m) has to reduce it to that share."""
+"""Steps in which a draft whose robots penetrate by more than that (m) all the time has to reduce it to that share."""
 _SHALLOW = 1e-3
 """Penetration (m) at the program's own samples that makes a finer look pointless."""
 _TRUE, _FALSE = 0.7, 0.25
@@ -201,7 +201,8 @@ class Optimiser:
     def stuck(self) -> bool:
         """Whether a draft has not come out of collision and does not get any further."""
         depths = self._depths[-_LINGER:]
-        return np.isinf(self.cost) and len(depths) == _LINGER and depths[-1] > max(_LODGED, _YIELDS * max(depths))
+        lodged = len(depths) == _LINGER and min(depths) > _LODGED
+        return np.isinf(self.cost) and lodged and depths[-1] > _YIELDS * max(depths)
 
     # -- one step ---------------------------------------------------------------------------------------------------
 

@@ -29,7 +29,10 @@ _NEVER = 1e6
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """Motions that may still collide: `conflict` is the depth of penetration (m) summed along the motion (rad or m)."""
+    """Motions that may still collide; `conflict` is the squared depth of penetration (m^2) along the motion (rad or m).
+
+    What is grazed for long is easily pulled apart; robots that pass through each other are not.
+    """
 
     segments: list[Segment]
     transitions: list[Transition]
@@ -297,7 +300,7 @@ def _overlapping(a: State, b: State) -> tuple[np.ndarray, np.ndarray]:
 def _cheapest(
     rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, never: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """A cheapest monotone path from corner to corner: rows (P,), columns (P,), and the depth summed along it.
+    """A cheapest monotone path from corner to corner: rows (P,), columns (P,), and the squared depth along it.
 
     A step of rows (T,) and columns (N,), or of one of them, takes as long as the longer of the two.
     """
@@ -325,7 +328,7 @@ def _cheapest(
         if n:
             choices.append((cost[t, n - 1] + columns[n] * charge[t, n], t, n - 1))
         _, u, m = min(choices)
-        conflict += depth[t, n] * max(rows[t] * (t - u), columns[n] * (n - m))
+        conflict += depth[t, n] ** 2 * max(rows[t] * (t - u), columns[n] * (n - m))
         t, n = u, m
         path.append((t, n))
     row, column = np.array(path[::-1]).T

@@ -1,0 +1,121 @@
+"""Timing drafts against brute force on the coordination grid, and against the judge."""
+
+from __future__ import annotations
+
+from itertools import pairwise, product
+from pathlib import Path
+
+import networkx as nx
+import numpy as np
+import pytest
+from discs import RADIUS, Errands, disc_problem, errand
+from gantry import gantry_problem, valid_plan
+
+from mrtamp.check import Checker
+from mrtamp.collision import Collision
+from mrtamp.optimise.nearness import Nearness
+from mrtamp.optimise.yielding import Draft, Yielding
+from mrtamp.plan import Plan, plan_cost
+from mrtamp.problem import Problem
+
+THICK = 0.1
+"""Of the discs (m): what overlaps by more parts upwards."""
+
+
+def timed(plan: Plan) -> Draft:
+    return Yielding(plan.problem, Nearness(Collision(plan.problem))).time(plan.segments, plan.transitions)
+
+
+def crossing(problem: Problem, a_to: tuple[float, float], b_to: tuple[float, float]) -> Plan:
+    return Errands(problem).move(a=a_to, b=b_to).plan()
+
+
+def charged(length: float, depth: float) -> float:
+    return length * (1 + 10 * depth + 300 * depth**2)
+
+
+def depth(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.clip(2 * RADIUS - np.linalg.norm(a - b), 0.0, THICK))
+
+
+def cheapest(a: np.ndarray, b: np.ndarray) -> float:
+    """Over all monotone paths on the grid of two ways (T, 2), (N, 2)."""
+    graph = nx.DiGraph()
+    for i, j in product(range(len(a)), range(len(b))):
+        for k, m in ((i + 1, j), (i, j + 1), (i + 1, j + 1)):
+            if k < len(a) and m < len(b):
+                longest = max(np.linalg.norm(a[k] - a[i]), np.linalg.norm(b[m] - b[j]))
+                graph.add_edge((i, j), (k, m), weight=charged(float(longest), depth(a[k], b[m])))
+    return float(nx.dijkstra_path_length(graph, (0, 0), (len(a) - 1, len(b) - 1)))
+
+
+@pytest.mark.parametrize(
+    ("a_to", "b_to"),
+    [
+        ((0.5, -1.5), (-0.5, -1.5)),  # both could be in the middle at once
+        ((0.5, -1.0), (-0.5, -1.0)),
+        ((-0.5, -1.5), (0.5, -1.5)),  # side by side
+        ((0.5, -0.7), (-0.5, -0.7)),  # no timing helps: they have to go through each other
+    ],
+)
+def test_two_discs_wait_for_each_other_as_brute_force_has_it(tmp_path: Path, a_to: tuple, b_to: tuple) -> None:
+    problem = disc_problem(tmp_path)
+    draft = timed(crossing(problem, a_to, b_to))
+    [segment] = draft.segments
+    a, b = segment.q["a"], segment.q["b"]
+    cost = conflict = 0.0
+    for i, j in pairwise(range(len(a))):
+        longest = max(np.linalg.norm(a[j] - a[i]), np.linalg.norm(b[j] - b[i]))
+        cost += charged(float(longest), depth(a[j], b[j]))
+        conflict += float(longest) * depth(a[j], b[j]) ** 2
+    ways = []
+    for robot, to in zip(problem.robots, (a_to, b_to), strict=True):
+        length = float(np.linalg.norm(np.array(to) - robot.start))
+        ways.append(np.linspace(robot.start, to, int(np.ceil(length / 0.3 - 1e-9)) + 1))
+    assert cost == pytest.approx(cheapest(*ways), rel=2e-3)
+    assert draft.conflict == pytest.approx(conflict, abs=1e-5)
+    for robot, to, q in zip(problem.robots, (a_to, b_to), (a, b), strict=True):
+        assert np.array_equal(q[0], robot.start) and np.allclose(q[-1], to)
+
+
+def test_waiting_takes_the_place_of_a_collision(tmp_path: Path) -> None:
+    plan = crossing(disc_problem(tmp_path), (0.5, -1.5), (-0.5, -1.5))
+    draft = timed(plan)
+    assert plan_cost(draft.segments, draft.transitions, plan.problem.cost) > plan.cost
+    distances = np.linalg.norm(draft.segments[0].q["a"] - draft.segments[0].q["b"], axis=1)
+    assert distances.min() > 2 * RADIUS - 0.05
+
+
+@pytest.mark.parametrize("toy", ["discs", "gantries"])
+def test_what_was_valid_stays_valid_and_takes_no_longer(tmp_path: Path, toy: str) -> None:
+    plan = errand(disc_problem(tmp_path)) if toy == "discs" else valid_plan(gantry_problem(tmp_path))
+    draft = timed(plan)
+    assert draft.conflict == 0.0
+    cost = plan_cost(draft.segments, draft.transitions, plan.problem.cost)
+    assert cost <= plan.cost + 1e-9
+    assert draft.segments[-1].mode.key == plan.segments[-1].mode.key
+    assert sorted(map(id, draft.transitions)) == sorted(map(id, plan.transitions))
+    again = Plan(plan.problem, draft.segments, draft.transitions, cost)
+    assert not [v for v in Checker(plan.problem).check(again).violations if v.kind != "goal"]
+
+
+def test_who_need_not_wait_does_not(tmp_path: Path) -> None:
+    """a's visit comes last in the plan, though a could be there long before b has taken the token and dropped it."""
+    problem = disc_problem(tmp_path)
+    plan = (
+        Errands(problem)
+        .move(b=(0.9, -0.5))
+        .reach("take")
+        .move(b=(0.5, -0.5))
+        .move(b=(0.5, 0.5))
+        .reach("drop")
+        .move(a=(-0.5, -0.9))
+        .reach("visit")
+        .plan()
+    )
+    draft = timed(plan)
+    order = [t.actions[0].subgoal for t in draft.transitions]
+    assert order.index("take") < order.index("drop")
+    lengths = {"a": 0.4, "b": 0.4 + 0.4 + 1.0}
+    cost = plan_cost(draft.segments, draft.transitions, problem.cost) - problem.cost.of_changes(["reach"] * 3)
+    assert cost == pytest.approx(max(lengths.values()) + 0.01 * sum(lengths.values())), "a moves while b does"
