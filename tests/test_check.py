@@ -25,6 +25,7 @@ from mrtamp.problem import (
     AtPose,
     CostWeights,
     HeldBy,
+    InRegion,
     MovableObject,
     Problem,
     Robot,
@@ -33,7 +34,7 @@ from mrtamp.problem import (
     StaticBody,
 )
 from mrtamp.problem_file import load_robot_model
-from mrtamp.scene import build_scene
+from mrtamp.scene import build_scene, gripper_bodies, robot_body
 
 
 @pytest.fixture(scope="module")
@@ -437,6 +438,40 @@ def test_opening_fingers_must_have_room(tmp_path: Path) -> None:
         assert ok or any(v.segment == 1 and v.fraction == 1.0 for v in meetings)
 
 
+@pytest.mark.parametrize(
+    ("margin", "x", "support", "kinds"),
+    [
+        (0.0, 0.049, "target", set()),
+        (0.02, 0.029, "target", set()),
+        (0.02, 0.031, "target", {"rest", "goal"}),
+        (0.02, 0.031, "floor", {"goal"}),
+        (0.06, 0.0, "target", set()),
+        (0.06, 0.001, "target", {"rest", "goal"}),
+    ],
+)
+def test_origins_keep_the_margin_of_a_region(
+    problem: Problem, margin: float, x: float, support: str, kinds: set[str]
+) -> None:
+    supports = tuple(dataclasses.replace(s, margin=margin) if s.name == "target" else s for s in problem.supports)
+    fenced = dataclasses.replace(problem, supports=supports, goal=(InRegion("cube", "target"),))
+    s = _pick(fenced).move(left=(-0.4, 0, 0.2)).move(left=(x, 0, 0.2)).move(left=(x, 0, 0.04))
+    s.change("place", put("cube", x, 0, CUBE[2], support)).move(left=(x, 0, 0.2))
+    assert check_plan(price(s.plan())).kinds == kinds
+
+
+def test_a_grasp_may_be_for_some_robots_only(problem: Problem) -> None:
+    for robots, ok in ((("left", "right"), True), (("right",), False)):
+        own = tuple(
+            dataclasses.replace(o, grasps=tuple(dataclasses.replace(g, robots=robots) for g in o.grasps))
+            if o.name == "cube"
+            else o
+            for o in problem.objects
+        )
+        report = check_plan(valid_plan(dataclasses.replace(problem, objects=own)))
+        assert report.ok == ok
+        assert ok or any("only for right" in v.message for v in report.violations if v.kind == "grasp")
+
+
 def test_objects_may_not_be_put_into_each_other(problem: Problem, checker: Checker) -> None:
     s = _pick(problem).move(left=(-0.4, 0, 0.2)).move(left=(-0.4, 0.265, 0.2)).move(left=(-0.4, 0.265, 0.04))
     s.change("place", put("cube", -0.4, 0.265, CUBE[2]))
@@ -508,7 +543,7 @@ class BruteForce:
         manager.Apply(CollisionFilterDeclaration().ExcludeWithin(ids(still)))
         for name, (robot, _) in carried.items():
             in_scene = self.scene.robots[robot]
-            hand = [plant.GetBodyByName(b, in_scene.instance) for b in in_scene.robot.model.gripper.bodies]
+            hand = gripper_bodies(plant, in_scene)
             manager.Apply(CollisionFilterDeclaration().ExcludeBetween(ids(hand), ids(self.scene.free_bodies[name])))
         self.root, self.context = self.scene.context()
 
@@ -527,7 +562,7 @@ class BruteForce:
                 plant.SetPositions(self.context, q)
                 for name, (robot, X_GO) in self.carried.items():
                     model = scene.robots[robot].robot.model
-                    body = plant.GetBodyByName(model.grasp_body, scene.robots[robot].instance)
+                    body = robot_body(plant, scene.robots[robot], model.grasp_body)
                     X_WG = body.EvalPoseInWorld(self.context) @ model.X_BG
                     scene.write_pose(q, name, X_WG.GetAsMatrix4() @ X_GO)
                 plant.SetPositions(self.context, q)

@@ -89,6 +89,8 @@ def test_no_plan_is_exit_1_with_a_reason(tmp_path: Path, capsys: pytest.CaptureF
     assert main(["plan", *hopeless, "--json"]) == 1
     data = json.loads(capsys.readouterr().out)
     assert data["ok"] is False and "1 iterations" in data["reason"] and "explanation" in data
+    assert data["seed"] == 0 and data["elapsed_s"] > 0 and data["counts"]["collision_checks"] > 0
+    assert data["sampled_bound"] is None, "without skeletons nothing is known"
     assert main(["plan", *hopeless, "--quiet"]) == 1
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.count("\n") == 1
@@ -114,6 +116,18 @@ def test_view_and_show_write_pages(planned: Path, tmp_path: Path, capsys: pytest
         assert str(page) in capsys.readouterr().out
 
 
+def test_show_warns_of_a_start_that_no_plan_can_have(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for x, warned in ((0.5, False), (-0.45, True)):
+        problem = {"mrtamp": 1, "name": "near", "goal": [{"robot": "a", "at": "home"}], "robots": []}
+        for name, place in (("a", -0.5), ("b", x)):
+            problem["robots"].append({"name": name, "model": "panda", "X_WB": {"translation": [place, 0, 0]}})
+        (tmp_path / "near.yaml").write_text(json.dumps(problem), encoding="utf-8")
+        assert main(["show", str(tmp_path / "near.yaml"), "--html", str(tmp_path / "near.html")]) == 0
+        said = capsys.readouterr()
+        assert "wrote" in said.out
+        assert ("warning: problem near: the start is not valid: a/" in said.err) == warned
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -122,6 +136,7 @@ def test_view_and_show_write_pages(planned: Path, tmp_path: Path, capsys: pytest
         (["plan", "handover", "--robots", "3"], "robots"),
         (["plan", "pick_place", "--robots", "99"], "99"),
         (["plan", "handover", "--out", "/proc/nowhere/plan.json"], "/proc/nowhere/plan.json"),
+        (["plan", str(Path(__file__).parent)], f"{Path(__file__).parent} is a directory"),
         (["plan", "handover", "--out", "."], "directory"),
         (["plan", "handover", "--out", "/dev/null"], "regular"),
         (["plan", "handover", "--out", "same", "--html", "same"], "same file"),

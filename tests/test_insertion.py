@@ -12,6 +12,7 @@ from arena import XY, Parts, arena, visit, wall
 from mrtamp.modes import Mode
 from mrtamp.plan import Plan, measures
 from mrtamp.problem import Problem
+from mrtamp.roadmap import Roadmap
 from mrtamp.space_time import STEP
 from mrtamp.transitions.candidate import Candidate
 
@@ -156,3 +157,23 @@ def test_equal_generators_give_equal_plans(tmp_path: Path) -> None:
     assert one is not None and two is not None
     for robot in starts:
         np.testing.assert_array_equal(one.segments[0].q[robot], two.segments[0].q[robot])
+
+
+def test_who_steps_aside_goes_where_the_roadmap_has_a_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """b has to leave the doorway for a; ways that no roadmap has are sought to where robots end, nowhere else."""
+    ends: dict[str, XY] = {"a": (1, 0), "b": (0, 0)}
+    closed = wall("closed", (1.5, -2.5), (1.6, 2.5))
+    skeleton = Skeleton(arena(tmp_path, {"a": (-1, 0), "b": (0, 0)}, ends, walls=[*DOORWAY, closed]), vertices=4)
+    for y in np.linspace(-1, 1, 9):
+        skeleton.parts.vertex("b", (1.85, float(y)))
+    connector = skeleton.insertion.steering.connector
+    sought: list[tuple[str, int]] = []
+
+    def connect(roadmap: Roadmap, mode: Mode, a: int, b: int, *_: object) -> bool:
+        sought.append((roadmap.name, b))
+        return False
+
+    monkeypatch.setattr(connector, "connect", connect)
+    for _ in range(5):
+        skeleton.realise()
+    assert set(sought) <= set(skeleton.goal.items())

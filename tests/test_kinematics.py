@@ -14,7 +14,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from mrtamp.kinematics import Chain, Tool, inverse, matrix, quaternions, rotation_vectors
 from mrtamp.problem import MrtampError, Problem, Robot, RobotModel
 from mrtamp.robot_file import load_robot_model
-from mrtamp.scene import Scene, build_scene, chain_of
+from mrtamp.scene import Scene, build_scene, chain_of, robot_joints
 
 ROOT = Path(__file__).resolve().parents[1]
 DRAKE_MODELS = Path(os.environ.get("DRAKE_MODELS_DIR", ROOT.parent / "shared" / "drake_models"))
@@ -145,7 +145,7 @@ def test_joints_that_are_not_planned_for_stay_where_they_are_fixed(tmp_path: Pat
     scene = alone(odd_robot(tmp_path))
     in_scene = scene.robots["robot"]
     model = in_scene.robot.model
-    chain = Chain(scene.plant, in_scene.instance, "foot", X_WB, model.arm_joints, {"passive": 0.7, "aside": 0.15})
+    chain = Chain(robot_joints(scene.plant, in_scene), "foot", X_WB, model.arm_joints, {"passive": 0.7, "aside": 0.15})
     q = samples(chain, 5)
     X_WG = Tool(chain, "tip", RigidTransform()).matrix(q)
     R, p = chain.poses(q)
@@ -176,7 +176,7 @@ def test_a_tool_on_a_branch_or_on_the_base_has_the_right_columns(tmp_path: Path)
 def test_an_unknown_arm_joint_is_named(tmp_path: Path) -> None:
     scene = alone(odd_robot(tmp_path))
     with pytest.raises(MrtampError, match=r"elbow.*lift"):
-        Chain(scene.plant, scene.robots["robot"].instance, "foot", X_WB, ("lift", "elbow"), {})
+        Chain(robot_joints(scene.plant, scene.robots["robot"]), "foot", X_WB, ("lift", "elbow"), {})
 
 
 def rotations() -> list[RotationMatrix]:

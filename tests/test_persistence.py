@@ -19,7 +19,7 @@ from pydrake.math import RigidTransform
 from mrtamp.check import check_plan
 from mrtamp.guidance import Choice
 from mrtamp.modes import Mode
-from mrtamp.planner import Options, Planner
+from mrtamp.planner import _RAREST, Options, Planner
 from mrtamp.problem import (
     AntipodalGrasps,
     InRegion,
@@ -160,7 +160,10 @@ def test_search_keeps_its_turns_beside_skeletons_and_refinement(tmp_path: Path) 
     assert planner.best is not None
     list(planner.improve(iterations=80))
     total = planner._effort.total
-    assert all(total[name] >= 0.5 * floor * 80 for name, floor in planner._effort.floors.items()), total
+    least = {name: 0.5 * floor * 80 for name, floor in planner._effort.floors.items()}
+    # What leads to nothing new, as in so small a problem, has its turn ever more rarely, but for ever.
+    least["skeletons"] = min(least["skeletons"], 80 / 2**_RAREST)
+    assert all(total[name] >= least[name] for name in total), total
 
 
 @pytest.mark.parametrize("persistent", [0.1, 0.4])

@@ -227,6 +227,26 @@ def test_what_failed_where_is_told_by_seed(address: str, tmp_path: Path) -> None
     assert "there" in portfolio.explain()
 
 
+def test_every_seed_plans_for_the_whole_budget_and_says_in_time_why_there_is_no_plan(tmp_path: Path) -> None:
+    """It takes longer than the budget to start the workers, which therefore is no part of it."""
+    problem = arena(
+        tmp_path, {"a": (-1, 0)}, subgoals=[visit("there", "a", (1, 0))], walls=[wall("wall", (-0.1, -2.5), (0.1, 2.5))]
+    )
+    portfolio = SeedPortfolio(problem, [8, 9], options=QUICK)
+    assert not list(portfolio.improve(0.5))
+    for seed in (8, 9):
+        assert f"seed {seed}: " in portfolio.explain()
+        assert portfolio.reports[seed].counts["edges_validated"] > 0, "it has planned"
+    assert "cut short" not in portfolio.explain()
+
+
+def test_a_plan_that_costs_nothing_ends_it(address: str, tmp_path: Path) -> None:
+    portfolio = SeedPortfolio(arena(tmp_path, {"a": (0, 0)}, {"a": (0, 0)}), [0], scheduler=address)
+    began = time.monotonic()
+    assert [plan.cost for plan in portfolio.improve(600.0)] == [0.0]
+    assert time.monotonic() - began < 60.0
+
+
 @pytest.mark.parametrize("seeds", [[], [1, 1]])
 def test_seeds_are_different(seeds: list[int], tmp_path: Path) -> None:
     with pytest.raises(MrtampError, match="expected at least one, all different"):

@@ -128,6 +128,39 @@ def test_region_defaults_to_the_whole_top() -> None:
     support = load(change(", X_BS: {translation: [0.4, 0, 0.05]}, size: [0.4, 0.6]", "")).support("right_table")
     assert support.size == (2.0, 1.0)
     assert support.X_BS.IsNearlyEqualTo(RigidTransform([0, 0, 0.05]), 0)
+    assert support.margin == 0.01, "things would fall over the edge"
+    assert support.reach == (0.99, 0.49)
+
+
+@pytest.mark.parametrize(
+    ("keys", "margin"),
+    [
+        (", size: [0.4, 0.6]", 0.0),
+        (", size: [0.4, 0.6], margin: 0.03", 0.03),
+        (", margin: 0", 0.0),
+        (", X_BO: {translation: [0.999, 0, 0.09]}", 0.0),
+    ],
+)
+def test_margin_of_a_support(keys: str, margin: float) -> None:
+    problem = load(change(", X_BS: {translation: [0.4, 0, 0.05]}, size: [0.4, 0.6]", keys))
+    assert problem.support("right_table").margin == margin
+    assert problem_from_dict(problem_to_dict(problem)).support("right_table").margin == margin
+    assert {s.margin for s in problem.supports if s.name != "right_table"} == {0.0}
+
+
+def test_start_keeps_the_margin_of_its_region() -> None:
+    text = change("size: [0.4, 0.6]}\n  - {name: right", "size: [0.4, 0.6], margin: 0.1}\n  - {name: right")
+    load(text)
+    with pytest.raises(ProblemError, match=r"less its margin of 0\.1 m: \|x\| <= 0\.1, \|y\| <= 0\.2"):
+        load(change("xy: [0.1, 0.2]", "xy: [0.11, 0.2]", text))
+
+
+def test_grasps_for_some_robots() -> None:
+    text = change("width: 0.05}", "width: 0.05, robots: [right]}")
+    problem = load(change("depth: [0.02, 0.03]}", "depth: [0.02, 0.03]}\n        robots: [left, right]", text))
+    for read in (problem, problem_from_dict(problem_to_dict(problem))):
+        assert [grasp.robots for grasp in read.object("red").grasps] == [("left", "right"), ("right",)]
+        assert {grasp.robots for grasp in read.object("blue").grasps} == {None}
 
 
 def test_top_is_the_face_that_looks_up() -> None:
@@ -221,7 +254,7 @@ def test_model_files_as_objects_and_world(folder: Path) -> None:
     text = change("shape: {cylinder: [0.03, 0.08]}", "model: part.urdf\n    grasps: [{X_OG: {}, width: 0.04}]")
     problem = load(change("X_WO: {translation: [0.3, 0.2, 0.04]}", "X_WO: {translation: [0.3, 0.2, 0]}", text))
     assert problem.object("blue").model == str(folder / "part.urdf")
-    with pytest.raises(ProblemError, match=r"0\.0500 m above"):
+    with pytest.raises(ProblemError, match=r"floating 0\.05 m above"):
         load(change("[0.3, 0.2, 0.04]", "[0.3, 0.2, 0.05]", text))
 
 

@@ -71,6 +71,9 @@ class Mistake:
 MISTAKES = {
     "version": Mistake("mrtamp: 1", "mrtamp: 2", "mrtamp", ("found 2", "version 1")),
     "unknown section": Mistake("cost:", "costs:", "costs", ("'costs'", "did you mean 'cost'", "supports")),
+    "goal misspelt": Mistake(
+        "goal:", "gaol:", "gaol", ("mrtamp, name, robots, goal, description, packages", "did you mean 'goal'")
+    ),
     "unknown key": Mistake("mass: 0.2", "maas: 0.2", "objects[0].maas", ("'maas'", "did you mean 'mass'", "color")),
     "missing key": Mistake(
         "shape: {cylinder: [0.03, 0.08]}\n    start: {on: table, X_WO: {translation: [0.3, 0.2, 0.04]}}",
@@ -229,7 +232,11 @@ MISTAKES = {
         schema=False,
     ),
     "start floats": Mistake(
-        "[0.3, 0.2, 0.04]", "[0.3, 0.2, 0.09]", "objects[1].start.X_WO", ("0.0500 m above", "'table'"), schema=False
+        "[0.3, 0.2, 0.04]",
+        "[0.3, 0.2, 0.09]",
+        "objects[1].start.X_WO",
+        ("floating 0.05 m above 'table'",),
+        schema=False,
     ),
     "start beside the table": Mistake(
         "[0.3, 0.2, 0.04]", "[0.3, 0.7, 0.04]", "objects[1].start.X_WO", ("0.200 m beside 'table'",), schema=False
@@ -263,6 +270,25 @@ MISTAKES = {
     ),
     "explicit grasp too wide": Mistake(
         "width: 0.05", "width: 0.12", "objects[0].grasps[1].width", ("0.12", "opening of 0.08 m"), schema=False
+    ),
+    "grasp for nobody": Mistake(
+        "width: 0.05}",
+        "width: 0.05, robots: []}",
+        "objects[0].grasps[1].robots",
+        ("found []", "at least one robot"),
+    ),
+    "grasp for a stranger": Mistake(
+        "width: 0.05}",
+        "width: 0.05, robots: [lefd]}",
+        "objects[0].grasps[1].robots[0]",
+        ("'lefd'", "robots with a gripper: left, right", "did you mean 'left'"),
+        schema=False,
+    ),
+    "negative margin": Mistake(
+        "[0.4, 0, 0.05]}, size: [0.4, 0.6]",
+        "[0.4, 0, 0.05]}, size: [0.4, 0.6], margin: -0.01",
+        "supports[1].margin",
+        ("-0.01", "at least 0"),
     ),
     "object too wide": Mistake(
         "{cylinder: [0.03, 0.08]}",
@@ -298,7 +324,7 @@ MISTAKES = {
         "red, in: right_table",
         "red, at: {translation: [0, 0, 0.02]}, on: table",
         "goal[0].at",
-        ("0.0050 m below", "'table'"),
+        ("0.005 m too low on 'table'",),
         schema=False,
     ),
     "goal without place": Mistake("{object: red, in: right_table}", "{object: red}", "goal[0]", ("in, on, held_by",)),

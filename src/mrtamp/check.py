@@ -210,7 +210,8 @@ class Checker:
                 elif isinstance(c, InRegion):
                     region = self.problem.support(c.region)
                     p = (region.X_BS.inverse().GetAsMatrix4() @ a.X_PO)[:2, 3]
-                    inside = bool((np.abs(p) <= np.asarray(region.size) / 2 + POSITION_TOLERANCE).all())
+                    half = np.maximum(np.asarray(region.size) / 2 - region.margin, 0.0)
+                    inside = bool((np.abs(p) <= half + POSITION_TOLERANCE).all())
                     why = None if a.parent == region.body and inside else f"{c.object} is not in {c.region}"
             if why:
                 report.add(Violation("goal", why, k))

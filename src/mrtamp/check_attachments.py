@@ -98,6 +98,9 @@ class AttachmentJudge:
         X_OG = inverse(a.X_PO)
         reasons = []
         for grasp in thing.grasps:
+            if grasp.robots is not None and robot.name not in grasp.robots:
+                reasons.append(f"only for {', '.join(grasp.robots)}")
+                continue
             why = (
                 _explicit(grasp, X_OG, a.width)
                 if isinstance(grasp, ExplicitGrasp)
@@ -140,9 +143,11 @@ class AttachmentJudge:
             exact = same_pose(a.X_PO, support.X_BO.GetAsMatrix4())
             return None if exact else f"is not at the exact pose of {support.name!r}"
         X_SO = inverse(support.X_BS.GetAsMatrix4()) @ a.X_PO
-        outside = float((np.abs(X_SO[:2, 3]) - np.asarray(support.size) / 2).max())
+        half = np.maximum(np.asarray(support.size) / 2 - support.margin, 0.0)
+        outside = float((np.abs(X_SO[:2, 3]) - half).max())
         if outside > POSITION_TOLERANCE:
-            return f"lies {outside * 1e3:.2f} mm outside {support.name!r}"
+            margin = f" less its margin of {support.margin:g} m" if support.margin else ""
+            return f"lies {outside * 1e3:.2f} mm outside {support.name!r}{margin}"
         faces = {f: float(-(X_SO[:3, :3] @ face_normal(f))[2]) for f in thing.resting_faces}
         face = max(faces, key=lambda f: faces[f])
         if np.arccos(np.clip(faces[face], -1, 1)) > ANGLE_TOLERANCE:

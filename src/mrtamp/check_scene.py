@@ -19,7 +19,7 @@ from mrtamp.check_bounds import Envelopes, Screws, capsule_around
 from mrtamp.check_report import Side
 from mrtamp.kinematics import quaternions
 from mrtamp.problem import WORLD, MrtampError, Problem
-from mrtamp.scene import Scene, build_scene, touching_bodies
+from mrtamp.scene import Scene, build_scene, robot_bodies, robot_body, robot_joint, touching_bodies
 
 UNBOUNDED_SLIDE = 10.0
 """A prismatic joint without limits is judged within this many metres of zero."""
@@ -80,8 +80,8 @@ class JudgeScene:
         joints: list = []
         for name, robot in self.scene.robots.items():
             model = robot.robot.model
-            arm = [plant.GetJointByName(j, robot.instance) for j in model.arm_joints]
-            fingers = [plant.GetJointByName(j, robot.instance) for j in (model.gripper.joints if model.gripper else ())]
+            arm = [robot_joint(plant, robot, j) for j in model.arm_joints]
+            fingers = [robot_joint(plant, robot, j) for j in (model.gripper.joints if model.gripper else ())]
             self.arm[name] = slice(len(joints), len(joints) + len(arm))
             self.fingers[name] = slice(len(joints) + len(arm), len(joints) + len(arm) + len(fingers))
             joints += arm + fingers
@@ -115,7 +115,7 @@ class JudgeScene:
         self._slide = np.where(self._prismatic, np.maximum(np.abs(low - at), np.abs(high - at)), 0.0)
         self.screws = Screws(self._axis, self._origin, self._prismatic, self._parent, at)
         self.grasp_body = {
-            name: plant.GetBodyByName(r.robot.model.grasp_body, r.instance) for name, r in self.scene.robots.items()
+            name: robot_body(plant, r, r.robot.model.grasp_body) for name, r in self.scene.robots.items()
         }
         self._X_BG = {name: r.robot.model.X_BG for name, r in self.scene.robots.items()}
         self.X_WG = {
@@ -184,8 +184,7 @@ class JudgeScene:
         self.of: dict[str, list[int]] = {}
         """Solids of an object or a static body, by name."""
         for name, robot in self.scene.robots.items():
-            for index in self.plant.GetBodyIndices(robot.instance):
-                body = self.plant.get_body(index)
+            for body in robot_bodies(self.plant, robot):
                 self._add(body, Side("robot", name, body.name()))
         for kind, groups in (("object", self.scene.free_bodies), ("static", self.scene.statics)):
             for name, bodies in groups.items():

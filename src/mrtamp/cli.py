@@ -1,7 +1,8 @@
 """The command line: list, plan, check, view, show, bench.
 
 Exit codes: 0 a plan was found and checked (or the check passed, or every aim of a suite was met), 1 no plan within the
-budget (or the check failed, or an aim was missed), 2 bad input.  What takes long to import is imported inside the
+budget (or the check failed, or an aim was missed), 2 bad input, 130 interrupted before there was anything to lose
+(see `mrtamp.__main__`).  What takes long to import is imported inside the
 command that needs it.
 """
 
@@ -15,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -31,11 +32,11 @@ from mrtamp.mechanisms import (
 
 if TYPE_CHECKING:
     from mrtamp.plan import Plan
-    from mrtamp.planners import AnyPlanner
+    from mrtamp.planners import AnyPlanner, PlannerOptions
     from mrtamp.portfolio_plan import SeedPortfolio
     from mrtamp.problem import Problem
 
-FOUND, NOT_FOUND, BAD_INPUT = 0, 1, 2
+FOUND, NOT_FOUND, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 DEFAULT_BUDGET_S = 10.0
 
 
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return FOUND
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
-        return NOT_FOUND
+        return INTERRUPTED
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -113,11 +114,13 @@ def _plan(options: argparse.Namespace) -> int:
     for path in (options.out, options.html):
         _ensure_writable(path)
     started = time.monotonic()
+    settings = _settings(options)
     planner: AnyPlanner | SeedPortfolio | None = None
     with _stop_on_signals() as signals, ProgressLine(sys.stderr, enabled=not options.quiet) as progress:
         try:
             problem = _load_problem(options)
-            planner = _planner(options, problem)
+            planner = _planner(options, problem, settings)
+            progress(planner.status())
             budget = options.budget
             if budget is None and options.iterations is None:
                 budget = DEFAULT_BUDGET_S
@@ -145,13 +148,28 @@ def _plan(options: argparse.Namespace) -> int:
     return FOUND
 
 
-def _planner(options: argparse.Namespace, problem: Problem) -> AnyPlanner | SeedPortfolio:
-    from mrtamp.planners import make_planner, planner_options
+def _settings(options: argparse.Namespace) -> PlannerOptions:
+    """The options of the planner that was asked for.
 
+    Everything that planning imports is imported here, before a signal becomes an exception.
+    """
+    import mrtamp.problem_file
+    from mrtamp.planners import planner_options
+
+    if options.portfolio is not None:
+        import mrtamp.portfolio_plan  # noqa: F401
+
+        with suppress(ImportError):  # what lacks is said by whoever needs it
+            import distributed  # noqa: F401
     given = {"without": options.without} if options.without else {}
     if options.intra_orbit is not None:
         given["intra_orbit"] = options.intra_orbit
-    settings = planner_options(options.planner, given)
+    return planner_options(options.planner, given)
+
+
+def _planner(options: argparse.Namespace, problem: Problem, settings: PlannerOptions) -> AnyPlanner | SeedPortfolio:
+    from mrtamp.planners import make_planner
+
     if options.portfolio is None:
         return make_planner(options.planner, problem, options.seed, settings)
     from mrtamp.portfolio_plan import SeedPortfolio
@@ -168,7 +186,9 @@ def _report_failure(
     if not stopped:
         reason = f"no plan within {_bounds(options)}"
     if options.json:
-        print(json.dumps({"ok": False, "problem": options.problem, "reason": reason, "explanation": explanation}))
+        data = {"ok": False, "stopped": stopped, "elapsed_s": elapsed, "problem": options.problem, "seed": options.seed}
+        data |= {"reason": reason, "explanation": explanation, "counts": planner.counts() if planner else {}}
+        print(json.dumps({**data, "sampled_bound": planner.sampled_bound if planner else None}))
     elif options.quiet:
         print(f"mrtamp: {reason}", file=sys.stderr)
     else:
@@ -254,7 +274,14 @@ def _view(options: argparse.Namespace) -> int:
 
 
 def _show(options: argparse.Namespace) -> int:
-    return _look(_load_problem(options), options)
+    from mrtamp.check import Checker
+    from mrtamp.incumbent import start_fault
+
+    problem = _load_problem(options)
+    fault = start_fault(Checker(problem))
+    if fault is not None:
+        print(f"mrtamp: warning: {fault}", file=sys.stderr)
+    return _look(problem, options)
 
 
 def _look(what: Plan | Problem, options: argparse.Namespace) -> int:
@@ -387,7 +414,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="mrtamp",
         description="Plan what several robot arms do together: who handles what, when, and every motion.",
-        epilog="Exit codes: 0 found and checked, 1 no plan, a failed check or a missed aim, 2 bad input.",
+        epilog="Exit codes: 0 found and checked, 1 no plan, failed check or missed aim, 2 bad input, 130 interrupted.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
@@ -417,7 +444,8 @@ def _parser() -> argparse.ArgumentParser:
         "--portfolio",
         type=count,
         metavar="N",
-        help="plan with N seeds side by side, from --seed on; the best wins",
+        help="plan with N seeds side by side, from --seed on, each for the whole --budget, which counts from when all "
+        "have started; the best wins",
     )
     plan.add_argument(
         "--scheduler", metavar="ADDRESS", help="where: a Dask scheduler, tcp://host:port (default: N processes here)"

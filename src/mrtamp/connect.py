@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from mrtamp.collision import bisection_order
+from mrtamp.deadline import Deadline
 from mrtamp.modes import Attachment, Mode
 from mrtamp.roadmap import Roadmap
 from mrtamp.transitions.projection import uniform_configurations
@@ -46,9 +47,10 @@ class _Tree:
 class Connector:
     """Finds motions of one robot in one mode and adds their knots to its roadmap."""
 
-    def __init__(self, validity: Validity, rng: np.random.Generator) -> None:
+    def __init__(self, validity: Validity, rng: np.random.Generator, deadline: Deadline | None = None) -> None:
         self.validity = validity
         self.rng = rng
+        self.deadline = deadline or Deadline()
 
     def connect(
         self,
@@ -63,6 +65,10 @@ class Connector:
 
         Contact vertices are joined from the far ends of their chains.  `standing` are configurations of other robots
         that the path has to keep clear of as well.
+
+        Raises
+        ------
+        TimeIsUp : the deadline has passed; the roadmap is as it was.
         """
         starts, goals = (list(roadmap.exits.get(v, []))[-1:] or [v] for v in (a, b))
         world = roadmap.world
@@ -82,6 +88,7 @@ class Connector:
             return False
         one, two = _Tree(roadmap.q[starts[0]]), _Tree(roadmap.q[goals[0]])
         for k in range(iterations):
+            self.deadline.check()
             here, there = (one, two) if k % 2 == 0 else (two, one)
             target = uniform_configurations(world.tool, self.rng, 1)[0] if k > 1 else there.q[0]
             i = here.nearest(target)

@@ -3,12 +3,15 @@
     grasps: top | sides | antipodal          # from above / from the four sides / from all six; default: all but below
     grasps:
       - antipodal: {approach: ["-z", "+x"], offset: 0.01, depth: [0.02, 0.03]}
-      - {X_OG: {translation: [0, 0, 0.1], rotation: !Rpy {deg: [180, 0, 0]}}, width: 0.05}
+      - {X_OG: {translation: [0, 0, 0.1], rotation: !Rpy {deg: [180, 0, 0]}}, width: 0.05, robots: [left]}
 
-A grasp that no robot of the problem can close on is an error.
+Any robot may use any grasp that its gripper opens wide enough for, unless `robots` says which may.  A grasp that no
+robot of the problem can close on is an error.
 """
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 
@@ -29,11 +32,13 @@ MAX_DEPTH = 0.030
 TIP_CLEARANCE = 0.015
 
 
-def read_grasps(value: Value | None, owner: Value, shape: Shape | None, max_width: float) -> Grasps:
-    """The grasp families of an object of `shape` (None: a model file) for grippers that open up to `max_width` (m).
+def read_grasps(value: Value | None, owner: Value, shape: Shape | None, openings: dict[str, float]) -> Grasps:
+    """The grasp families of an object of `shape` (None: a model file).
 
-    `owner` is the object's own entry, for errors about an absent `grasps:`.
+    `openings` are the widest openings of all robots (m), 0 of those without a gripper; `owner` is the object's own
+    entry, for errors about an absent `grasps:`.
     """
+    max_width = max(openings.values())
     if value is None:
         if shape is None or max_width == 0.0:
             return ()
@@ -50,19 +55,32 @@ def read_grasps(value: Value | None, owner: Value, shape: Shape | None, max_widt
         return _families(shape, approaches, max_width)
     if not isinstance(value.data, list):
         raise value.wrong(f"{', '.join(APPROACHES)}, or a list of {{antipodal: ...}} and {{X_OG: ..., width: ...}}")
-    return tuple(g for item in value.items() for g in _read_family(item, shape, max_width))
+    return tuple(g for item in value.items() for g in _read_entry(item, shape, openings))
+
+
+def _read_entry(item: Value, shape: Shape | None, openings: dict[str, float]) -> Grasps:
+    """One entry of the list: its families, for the robots that it names."""
+    entries = item.mapping(optional=("antipodal", "X_OG", "width", "robots"))
+    if "robots" not in entries:
+        return _read_family(item, shape, max(openings.values()))
+    able = [name for name, opening in openings.items() if opening > 0.0]
+    robots = tuple(entry.choice(able, "robots with a gripper") for entry in entries["robots"].items())
+    if not robots or len(set(robots)) != len(robots):
+        raise entries["robots"].wrong("at least one robot, each once")
+    families = _read_family(item, shape, max(openings[name] for name in robots))
+    return tuple(dataclasses.replace(family, robots=robots) for family in families)
 
 
 def _read_family(item: Value, shape: Shape | None, max_width: float) -> Grasps:
-    entries = item.mapping(optional=("antipodal", "X_OG", "width"))
+    entries = item.mapping(optional=("antipodal", "X_OG", "width", "robots"))
     if "antipodal" not in entries:
-        explicit = item.mapping(("X_OG", "width"))
+        explicit = item.mapping(("X_OG", "width"), ("robots",))
         width = explicit["width"].number(above=0.0)
         if width > max_width:
             raise explicit["width"].error(f"found {width:g}, expected a width within {_opening(max_width)}")
         return (ExplicitGrasp(explicit["X_OG"].pose(), width),)
-    if len(entries) > 1:
-        raise item.error(f"found the keys {', '.join(entries)}, expected 'antipodal' alone, or 'X_OG' with 'width'")
+    if not set(entries) <= {"antipodal", "robots"}:
+        raise item.error(f"found the keys {', '.join(entries)}, expected 'antipodal', or 'X_OG' with 'width'")
     if shape is None:
         raise item.error("found 'antipodal' on a model file, expected {X_OG, width}")
     family = entries["antipodal"].mapping(optional=("approach", "offset", "depth"))

@@ -13,6 +13,7 @@ import numpy as np
 
 from mrtamp.check import Report
 from mrtamp.check_report import Violation
+from mrtamp.deadline import Deadline
 from mrtamp.graphs import Graphs
 from mrtamp.insertion import Insertion
 from mrtamp.intra_orbit.orbits import Orbits
@@ -54,6 +55,7 @@ class Growth:
         validity: Validity,
         rng: np.random.Generator,
         intra_orbit: str = "tensor-tree",
+        deadline: Deadline | None = None,
     ) -> None:
         self.problem = problem
         self.roadmaps = roadmaps
@@ -65,8 +67,9 @@ class Growth:
         self.tree = TensorTree(list(roadmaps.values()), problem.cost)
         graphs = list(roadmaps.values())
         self.orbits = Orbits(self.tree, self.graphs, graphs, validity)
-        self.motion = INTRA_ORBIT[intra_orbit](graphs, validity, self._insert, rng, problem.cost)
-        self.steering = Steering(graphs, validity, self._insert, rng)
+        deadline = deadline or Deadline()
+        self.motion = INTRA_ORBIT[intra_orbit](graphs, validity, self._insert, rng, problem.cost, deadline)
+        self.steering = Steering(graphs, validity, self._insert, rng, deadline)
         self.insertion = Insertion(roadmaps, validity.collision, validity, self.steering, rng)
         self.goal_vertices: dict[str, int] = {}
         self.goal_nodes: list[Node] = []

@@ -1,8 +1,8 @@
 """Where planning effort goes before there is a plan: optimistic modal guidance (paper, section V).
 
-Guidance works on names alone: for each object a small graph whose nodes are the places it can be (supports, robots)
-and whose edges are pick, place and handover, each at an optimistic cost of one, dearer the more often it was tried in
-vain.
+Guidance works on names: for each object a small graph whose nodes are the places it can be (supports, robots) and whose
+edges are pick, place and handover, each at an optimistic cost of one, dearer the more often it was tried in vain (see
+`mrtamp.transitions.estimates`).  Of grasps it knows no more than the face of the object that the hand comes from.
 """
 
 from __future__ import annotations
@@ -10,19 +10,14 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
-import networkx as nx
 import numpy as np
 
 from mrtamp.graphs import Graphs
-from mrtamp.modes import Mode, condition_holds
-from mrtamp.problem import AtPose, HeldBy, Problem, RobotAt, Subgoal
-from mrtamp.transitions.candidate import StratumKey
+from mrtamp.modes import Attachment, ModalState, Mode, condition_holds
+from mrtamp.problem import AtPose, Problem, RobotAt, Subgoal
+from mrtamp.transitions.candidate import Candidate, StratumKey
 from mrtamp.transitions.sampler import TransitionSampler
 
-FAILED_CALL = 3.0
-"""What a sampling call without any accepted sample adds to the optimistic cost of its edge."""
-SOFT_FAILURE = 0.3
-"""The same for a call in which IK succeeded; at most FAILED_CALL in all."""
 FAILED_TRY = 0.7
 """What a failure of a transition in one mode adds to it there."""
 FAILED_STATE = 0.35
@@ -32,8 +27,15 @@ VISITED = 0.3
 """Per square root of the visits to the modal state that a transition leads to: going back is no progress."""
 BLOCKED = 2.0
 """What is added to acting on an object while another stands in its way."""
-UNREACHABLE = 6.0
-"""Cost added before any attempt where the place lies outside the reach that was seen of the robot."""
+UNPROMISING = 4.0
+"""What is added to the cost after a grasp that the sampler saw no way on from, as far as it can see."""
+_DRAWS = 8
+"""Active sets that are drawn at a time, at most."""
+SLACK = 0.25
+"""How much dearer than the best way on a candidate may seem; failures add to that."""
+
+Outline = tuple[ModalState, tuple[int, ...]]
+"""A modal state, and from which face each of the held objects is held."""
 
 
 @dataclass(frozen=True)
@@ -62,79 +64,31 @@ class ModalGuidance:
         self._static = sampler.validity.X_WB
         self._conditions = {c.object: c for c in problem.goal if not isinstance(c, RobotAt)}
         self._led = {s.attach.object for s in problem.subgoals if s.attach is not None}
-        self._supports = {
-            o.name: [s for s in problem.supports if s.body != o.name and (s.objects is None or o.name in s.objects)]
-            for o in problem.objects
-        }
-        self._costs: dict[str, tuple[int, dict[str, float]]] = {}
-        self._hops: dict[str, dict[str, int]] = {}
+        self.estimates = sampler.estimates
+        self._visits: Counter[Outline] = Counter()
         self._failures: Counter[tuple[tuple, Choice]] = Counter()
-        self._reach_prior: dict[tuple[str, str], float] = {}
 
     # -- distances ------------------------------------------------------------------------------------------------
 
     def edge_cost(self, choice: Choice) -> float:
         """Optimistic cost of one transition: one, and what failed attempts and reach say against it."""
-        known = (self.sampler.outcomes.get(choice.key), self.sampler.foreseen.get(choice.key))
-        seen = [o for o in known if o is not None and o.calls]
-        if any(o.accepted for o in seen):
-            return 1.0
-        calls = sum(o.calls for o in seen)
-        if any(o.ik_solved for o in seen):
-            # Reachable, but in the way of something so far: that may depend on the grasp.
-            return 1.0 + min(SOFT_FAILURE * calls, FAILED_CALL)
-        return 1.0 + FAILED_CALL * calls + self._prior(choice)
-
-    def _prior(self, choice: Choice) -> float:
-        if choice.kind == "handover":
-            a, b = (self.sampler.reach[r] for r in choice.robots)
-            # A handover costs an extra transition already; between robots too far apart it cannot happen.
-            return 0.0 if np.linalg.norm(a[0] - b[0]) < a[1] + b[1] else UNREACHABLE
-        key = (choice.robots[0], choice.place)
-        if key not in self._reach_prior:
-            support = next((s for s in self.problem.supports if s.name == choice.place), None)
-            prior = 0.0
-            if support is not None and support.body in self._static:
-                X_WS = self._static[support.body] @ (support.X_BO or support.X_BS).GetAsMatrix4()
-                half = np.asarray(support.size) / 2
-                centre, radius = self.sampler.reach[choice.robots[0]]
-                local = np.linalg.inv(X_WS) @ np.append(centre, 1.0)
-                nearest = np.clip(local[:3], [-half[0], -half[1], 0], [half[0], half[1], 0])
-                prior = 0.0 if np.linalg.norm(local[:3] - nearest) <= radius else UNREACHABLE
-            self._reach_prior[key] = prior
-        return self._reach_prior[key]
+        return self.estimates.edge_cost(choice.key)
 
     def goal_places(self, item: str) -> list[str]:
         """Names of the supports or the robot that satisfy the object's goal."""
-        condition = self._conditions.get(item)
-        if isinstance(condition, HeldBy):
-            return [condition.robot]
-        return [s.name for s in self.sampler.goal_supports[item]]
+        return self.estimates.goal_places(item)
 
     def costs_to_goal(self, item: str) -> dict[str, float]:
-        """Optimistic number of transitions from every place of an object to its goal."""
-        known = (self.sampler.outcomes, self.sampler.foreseen)
-        version = sum(o.calls + bool(o.accepted) for table in known for k, o in table.items() if k[2] == item)
-        cached = self._costs.get(item)
-        if cached is not None and cached[0] == version:
-            return cached[1]
-        graph = nx.DiGraph()
-        for choice in self._choices(item):
-            start, end = _ends(choice)
-            cost = self.edge_cost(choice)
-            if not graph.has_edge(end, start) or graph.edges[end, start]["weight"] > cost:
-                graph.add_edge(end, start, weight=cost)
-        goals = [p for p in self.goal_places(item) if p in graph]
-        costs, paths = nx.multi_source_dijkstra(graph, goals) if goals else ({}, {})
-        self._costs[item] = (version, costs)
-        self._hops[item] = {place: len(path) - 1 for place, path in paths.items()}
-        return costs
+        """Optimistic cost of the transitions from every place of an object to its goal, held from the best face."""
+        costs = self.estimates.costs(item)
+        held = {r: float(costs.held[k].min()) for r, k in self.sampler.holds.number.items()}
+        return {place: cost for place, cost in (costs.resting | held).items() if np.isfinite(cost)}
 
     def _choices(self, item: str) -> list[Choice]:
         fits = [r for r in self.robots if self.sampler.families[r, item]]
         out = []
         for r in fits:
-            for s in self._supports[item]:
+            for s in self.estimates.supports[item]:
                 out += [Choice("pick", (r,), item, s.name), Choice("place", (r,), item, s.name)]
             out += [Choice("handover", (r, b), item, r) for b in fits if b != r]
         return out
@@ -164,7 +118,7 @@ class ModalGuidance:
         if self.done(mode, item):
             return 0
         estimate = self._remaining(mode, item)
-        return self._hops.get(item, {}).get(mode.of[item].place) or round(min(estimate, 4.0))
+        return self.estimates.transitions(mode.of[item]) or round(min(estimate, 4.0))
 
     def _remaining(self, mode: Mode, item: str) -> float:
         a = mode.of[item]
@@ -179,7 +133,7 @@ class ModalGuidance:
             return 1.0 if a.held else 2.0
         if condition_holds(self.problem, condition, mode, self._static):
             return 4.0
-        return self.costs_to_goal(item).get(a.place, 2.0 + FAILED_CALL)
+        return self.estimates.to_goal(a)
 
     # -- experience -----------------------------------------------------------------------------------------------
 
@@ -195,17 +149,51 @@ class ModalGuidance:
             self._failures[mode.key, choice] += 1
             self._failures[mode.state, choice] += 1
 
-    def _discouragement(self, mode: Mode, choice: Choice) -> float:
-        """What speaks against a choice: failures, here and in modes alike but for poses, and where it leads."""
+    def _vain(self, mode: Mode, choice: Choice) -> float:
+        """What failures say against a choice, here and in modes alike but for poses."""
+        alike = min(FAILED_STATE * self._failures[mode.state, choice], FAILED_STATES)
+        return FAILED_TRY * self.failed(mode, choice) + alike
+
+    def _discouragement(self, mode: Mode, choice: Choice, face: int | None = None) -> float:
+        """What speaks against a choice: failures, and where it leads, with the object held from `face` then."""
         visits = 0
         if choice.kind != "reach":
             item, end = choice.object, _ends(choice)[1]
-            visits = self._graphs.visits(tuple((o, end if o == item else place) for o, place in mode.state))
-        return (
-            FAILED_TRY * self.failed(mode, choice)
-            + min(FAILED_STATE * self._failures[mode.state, choice], FAILED_STATES)
-            + VISITED * float(np.sqrt(visits))
-        )
+            held = {a.object: self._face(a) for a in mode.held.values() if a.object != item}
+            if face is not None:
+                held[item] = face
+            state = tuple((o, end if o == item else place) for o, place in mode.state)
+            visits = self._visits[state, tuple(held[o] for o in sorted(held))]
+        return self._vain(mode, choice) + VISITED * float(np.sqrt(visits))
+
+    def outline(self, mode: Mode) -> Outline:
+        """What tells modes apart for guidance: neither poses nor, but for their faces, grasps."""
+        return mode.state, tuple(self._face(a) for a in sorted(mode.held.values(), key=lambda a: a.object))
+
+    def _face(self, a: Attachment) -> int:
+        return self.sampler.holds.face(a)
+
+    def visit(self, mode: Mode) -> None:
+        """Count that work is done in a mode."""
+        self._graphs.modal.nodes[mode.state]["visits"] += 1
+        self._visits[self.outline(mode)] += 1
+
+    def visits(self, outline: Outline) -> int:
+        """How often work was done in modes of an outline."""
+        return self._visits[outline]
+
+    def leads_on(self, mode: Mode, choice: Choice, candidate: Candidate) -> bool:
+        """Whether a candidate seems hardly dearer than the best of its choice could be.
+
+        The more often the choice came to nothing the more is allowed for, so that in the end none is left out.
+        """
+        a = candidate.after
+        if choice.kind not in ("pick", "handover") or a is None:
+            return True
+        before = mode.of[choice.object]
+        best, _ = self.estimates.through(before, choice.key)
+        own = self.estimates.through_grasp(before, choice.key, a, UNPROMISING * (not candidate.promising))
+        return own <= best + SLACK + self._vain(mode, choice)
 
     # -- proposals ------------------------------------------------------------------------------------------------
 
@@ -243,10 +231,8 @@ class ModalGuidance:
             start, end = _ends(choice)
             if self.done(mode, item) and item not in blockers:
                 continue
-            costs = self.costs_to_goal(item)
-            rest = costs.get(end, 2.0 + FAILED_CALL)
-            here = costs.get(start, rest)
-            detour = self.edge_cost(choice) + rest - here
+            through, face = self.estimates.through(mode.of[item], choice.key)
+            detour = through - self.estimates.to_goal(mode.of[item])
             if item in blockers or (start in self.goal_places(item) and choice.kind == "pick"):
                 # Out of the way, to anywhere.
                 detour = min(detour, 1.0)
@@ -256,7 +242,8 @@ class ModalGuidance:
             if end in reserved and reserved[end] != item:
                 # That hand is about to take something else over.
                 detour += 3.0
-            out.append((max(detour, 0.0) + self._not_yet(mode, choice) + self._discouragement(mode, choice), choice))
+            against = self._not_yet(mode, choice) + self._discouragement(mode, choice, face)
+            out.append((max(detour, 0.0) + against, choice))
         out.sort(key=lambda pair: pair[0])
         return out
 
@@ -264,9 +251,9 @@ class ModalGuidance:
         """Robots that the best path of a held object hands it to, and that object."""
         out = {}
         for robot, a in mode.held.items():
-            costs = self.costs_to_goal(a.object)
             options = [c for c in self._choices(a.object) if c.kind != "pick" and c.robots[0] == robot]
-            best = min(options, key=lambda c: self.edge_cost(c) + costs.get(_ends(c)[1], np.inf), default=None)
+            through = [self.estimates.through(a, c.key)[0] for c in options]
+            best = options[int(np.argmin(through))] if options else None
             if best is not None and best.kind == "handover":
                 out[best.robots[1]] = a.object
         return out
@@ -298,16 +285,27 @@ class ModalGuidance:
         return out
 
     def feasible_sets(self, mode: Mode, rng: np.random.Generator) -> list[Choice]:
-        """A uniformly random non-empty active set and a random elementary transition for each of its robots.
+        """A random non-empty active set and a random elementary transition for each of its robots.
 
-        Empty when the drawn set has no joint assignment: the caller draws again another time.
+        Active sets without a joint assignment are drawn again; empty when that happens too often.
         """
         enabled = self.enabled(mode)
         names = [r.name for r in self.problem.robots]
-        members = [n for n in names if rng.random() < 0.5] or [names[int(rng.integers(len(names)))]]
+        for _ in range(_DRAWS):
+            members = [n for n in names if rng.random() < 0.5] or [names[int(rng.integers(len(names)))]]
+            out = self._assignment(mode, enabled, members, rng)
+            if out:
+                return out
+        return []
+
+    def _assignment(
+        self, mode: Mode, enabled: list[Choice], members: list[str], rng: np.random.Generator
+    ) -> list[Choice]:
+        """A random elementary transition for each of the robots, in random order; empty where one has none left."""
         out: list[Choice] = []
         used: set[str] = set()
-        for name in members:
+        # In a fixed order, the first would hardly ever wait for another to hand something over.
+        for name in [members[int(i)] for i in rng.permutation(len(members))]:
             if name in used:
                 continue
             options = [

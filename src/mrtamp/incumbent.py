@@ -57,12 +57,21 @@ class Incumbent:
 
     def check_start(self) -> None:
         """Refuse a problem whose start no plan can have: collisions, limits, objects that float or overlap."""
-        standing = Segment(start_mode(self.problem), {r.name: r.start[None] for r in self.problem.robots})
-        report = self._checker.check(self.plan([standing], []))
-        wrong = [v for v in report.violations if v.kind != "goal"]
-        if wrong:
-            more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
-            raise MrtampError(f"problem {self.problem.name}: the start is not valid: {wrong[0].message}{more}")
+        fault = start_fault(self._checker)
+        if fault is not None:
+            raise MrtampError(fault)
+
+
+def start_fault(checker: Checker) -> str | None:
+    """Why no plan of the checker's problem can have its start: a collision, a limit, an object that floats."""
+    problem = checker.problem
+    standing = Segment(start_mode(problem), {r.name: r.start[None] for r in problem.robots})
+    report = checker.check(Plan(problem, [standing], [], 0.0))
+    wrong = [v for v in report.violations if v.kind != "goal"]
+    if not wrong:
+        return None
+    more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+    return f"problem {problem.name}: the start is not valid: {wrong[0].message}{more}"
 
 
 def versions() -> dict[str, str]:

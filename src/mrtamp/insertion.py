@@ -104,6 +104,10 @@ class Insertion:
         variety : how often (0 to 1) a stop that can happen next does so although another could happen sooner, and a
             leg takes another way than the shortest.
         alone : robots keep clear of all but each other: a draft, as cheap as the skeleton promises where it is free.
+
+        Raises
+        ------
+        TimeIsUp : the deadline of `steering` has passed.
         """
         self.stuck = None
         self._variety = variety
@@ -198,10 +202,29 @@ class Insertion:
         if not all(self.validity.edge(r, self.roadmaps[r].edge(v, v), trial.mode) for r, v in candidate.at.items()):
             return None
         if not trial.time.happen(transition.active):
-            return None
+            return self._after_others_left(state, k, stand, targets, depth)
         trial.pending = tuple(x for x in state.pending if x != k)
         trial.transitions = (*state.transitions, transition)
         return trial
+
+    def _after_others_left(
+        self, state: _State, k: int, stand: Stand, targets: Mapping[str, int], depth: int
+    ) -> _State | None:
+        """The schedule in which stop k happens once a robot has gone from where an object will rest, or None."""
+        candidate = self._stand(k, state.mode, stand)
+        if depth == 0 or candidate is None:
+            return None
+        mode = state.mode.after(Transition((candidate.action,)))
+        for other in self.names:
+            v = state.at[other]
+            if other in candidate.at or self.validity.edge(other, self.roadmaps[other].edge(v, v), mode):
+                continue
+            for w in self._ways_out(state, other, targets):
+                moved = self._bring(state, other, w, targets, depth - 1, aside=True)
+                done = self._happen(moved, k, stand, targets, depth - 1) if moved is not None else None
+                if done is not None:
+                    return done
+        return None
 
     def _go_home(self, state: _State, goal: Mapping[str, int]) -> _State | None:
         """The schedule in which all robots end at their goals, or None; the first order that works is taken."""
@@ -224,11 +247,17 @@ class Insertion:
         targets: Mapping[str, int],
         depth: int,
         partners: frozenset[str] = frozenset(),
+        *,
+        aside: bool = False,
     ) -> _State | None:
-        """The schedule with a leg to vertex v inserted, others moved out of the way first where they stand in it."""
+        """The schedule with a leg to vertex v inserted, others moved out of the way first where they stand in it.
+
+        `aside`: the robot only has to get out of the way, and vertex v is one of many that may do.
+        """
         if state.at[robot] == v:
             return state
-        leg = self._leg(state, robot, v)
+        self.steering.deadline.check()
+        leg = self._leg(state, robot, v, connect=not aside)
         if leg is None:
             return None
         trial = state.copy()
@@ -248,7 +277,7 @@ class Insertion:
             for w in self._ways_out(state, other, targets):
                 if not self._clears(state, other, w, leg):
                     continue
-                moved = self._bring(state, other, w, targets, depth - 1)
+                moved = self._bring(state, other, w, targets, depth - 1, aside=True)
                 done = self._bring(moved, robot, v, targets, depth - 1) if moved is not None else None
                 if done is not None:
                     return done
@@ -269,7 +298,9 @@ class Insertion:
         trial.at[robot] = self._rows.vertex(robot, v)
         return robot not in trial.in_the_way(leg)
 
-    def _leg(self, state: _State, robot: str, v: int, around: frozenset[str] = frozenset()) -> Leg | None:
+    def _leg(
+        self, state: _State, robot: str, v: int, around: frozenset[str] = frozenset(), *, connect: bool = True
+    ) -> Leg | None:
         """The shortest way past the world, objects as they lie, and the robots `around` where they stand; or None."""
         at = tuple(state.at[r] for r in self.names)
         others = {r for r in self.names if r != robot} - around
@@ -277,7 +308,7 @@ class Insertion:
             path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, rounds=_AROUND, seek=True)
         else:
             detour = self.rng.random() < self._variety
-            path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, detour=detour)
+            path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, detour=detour, connect=connect)
         if path is None:
             return None
         return Leg({robot: self._rows.path(robot, path, state.time.at[robot])}, state.mode)

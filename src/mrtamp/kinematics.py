@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.multibody.tree import Joint
 
 from mrtamp.problem import MrtampError
 
@@ -97,8 +96,7 @@ class Chain:
 
     Parameters
     ----------
-    plant : finalised plant that contains the robot.
-    instance : the robot's model instance.
+    joints : all joints of the robot, of a finalised plant.
     base : name of its base link, fixed in the world at `X_WB`.
     arm_joints : names of the n joints that are planned for, in the order of q.
     fixed : positions (rad or m) of the other joints, such as fingers.
@@ -106,8 +104,7 @@ class Chain:
 
     def __init__(
         self,
-        plant: MultibodyPlant,
-        instance: ModelInstanceIndex,
+        joints: Sequence[Joint],
         base: str,
         X_WB: RigidTransform,
         arm_joints: tuple[str, ...],
@@ -120,7 +117,6 @@ class Chain:
         self.prismatic = np.zeros(self.n, dtype=bool)
         self.bodies: list[str] = [base]
         self.links = [_Link(-1, X_WB.rotation().matrix(), X_WB.translation(), "weld", -1, np.eye(3), np.zeros(3))]
-        joints = [plant.get_joint(j) for j in plant.GetJointIndices(instance)]
         self.index = {base: 0}
         pending = [j for j in joints if j.child_body().name() != base]
         while pending:

@@ -16,6 +16,7 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder
 
 from mrtamp.problem import ProblemError
@@ -62,6 +63,33 @@ def make_parser(
     return parser
 
 
+def add_models(plant: MultibodyPlant, parser: Parser, file: str, owner: str) -> tuple[ModelInstanceIndex, ...]:
+    """Add every model of `file` (a path or a `package://` URL) to `plant`, and return their model instances.
+
+    A file may hold several models: Drake model directives, or an SDF file that includes others.  Each instance is
+    renamed to `owner::NAME`, so that the same file can be added for the next owner.
+
+    Raises
+    ------
+    ProblemError
+        Drake cannot parse the file.
+    """
+    # Drake's own renaming (`Parser.SetAutoRenaming`) forgets that `<include merge="true">` refers to the old name.
+    before = plant.num_model_instances()
+    try:
+        if file.startswith("package://"):
+            parser.AddModelsFromUrl(file)
+        else:
+            parser.AddModels(file)
+    except Exception as error:  # Drake raises RuntimeError, but its parsers promise nothing
+        raise ProblemError(f"Drake cannot parse the model {file}: {_one_line(error)}") from None
+    # What the parser returns leaves out models inside models.
+    added = tuple(ModelInstanceIndex(i) for i in range(before, plant.num_model_instances()))
+    for instance in added:
+        plant.RenameModelInstance(instance, f"{owner}::{plant.GetModelInstanceName(instance)}")
+    return added
+
+
 def resolve_model(reference: str, directory: Path, package_paths: tuple[Path, ...] = ()) -> str:
     """The model `reference` as an absolute path, or unchanged if it is a `package://` URL of a known package.
 
@@ -99,19 +127,25 @@ def _model_path(reference: str, directory: Path, package_paths: tuple[Path, ...]
 
 @dataclass(frozen=True, eq=False)
 class ModelFacts:
-    """What a parsed model consists of.
+    """What a parsed model file consists of.
 
-    `joints` maps each joint with one degree of freedom to its lower and upper limits; `prismatic` are those that slide.
-    A `rigid` model is a single free body, or several welded to each other.
+    `models` names the models in it that have bodies; `joints` maps each joint with one degree of freedom to its lower
+    and upper limits; `prismatic` are those that slide.  A `rigid` model is a single free body, or several welded to
+    each other.  `repeated` are the names that several bodies or several moving joints have, `roots` the bodies that
+    nothing carries, `anchored` those that the file itself fixes to the world.
     """
 
     reference: str
+    models: tuple[str, ...]
     bodies: tuple[str, ...]
     joints: dict[str, tuple[np.ndarray, np.ndarray]]
     rigid: bool
     lower: np.ndarray | None
     upper: np.ndarray | None
     prismatic: frozenset[str] = frozenset()
+    repeated: tuple[str, ...] = ()
+    roots: tuple[str, ...] = ()
+    anchored: tuple[str, ...] = ()
 
     def bounding_box(self) -> tuple[np.ndarray, np.ndarray]:
         """Corners (3,), (3,) of the box around all collision geometry, in the frame of the model's base body."""
@@ -139,44 +173,55 @@ def _parse(reference: str, file: str, package_paths: tuple[Path, ...], stamp: in
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     parser = make_parser(plant, scene_graph, package_paths)
-    try:
-        instances = parser.AddModels(Path(file))
-    except Exception as error:  # Drake raises RuntimeError, but its parsers promise nothing
-        raise ProblemError(f"Drake cannot parse the model {reference}: {_one_line(error)}") from None
-    if len(instances) != 1:
-        raise ProblemError(f"{reference} holds {len(instances)} models, expected one")
+    instances = add_models(plant, parser, file, "model")
+    bodies = [plant.get_body(index) for instance in instances for index in plant.GetBodyIndices(instance)]
+    if not bodies:
+        raise ProblemError(f"{reference} holds no bodies, expected a model with at least one")
+    joints_in_file = [plant.get_joint(i) for instance in instances for i in plant.GetJointIndices(instance)]
+    anchored = [j.child_body().name() for j in joints_in_file if j.parent_body().index() == plant.world_body().index()]
     plant.Finalize()
-    bodies = tuple(plant.get_body(index).name() for index in plant.GetBodyIndices(instances[0]))
-    moving = [joint for joint in map(plant.get_joint, plant.GetJointIndices(instances[0])) if joint.num_positions() > 0]
+    moving = [
+        joint
+        for instance in instances
+        for joint in map(plant.get_joint, plant.GetJointIndices(instance))
+        if joint.num_positions() > 0
+    ]
     joints = {
         joint.name(): (joint.position_lower_limits(), joint.position_upper_limits())
         for joint in moving
         if joint.num_positions() == 1
     }
     # Drake gives every free body a floating joint when the plant is finalised.
-    rigid = len(moving) == 1 and len(plant.GetFloatingBaseBodies()) == 1
+    roots = [plant.get_body(index).name() for index in plant.GetFloatingBaseBodies()]
+    rigid = len(moving) == 1 and len(roots) == 1
     diagram = builder.Build()
     context = plant.GetMyContextFromRoot(diagram.CreateDefaultContext())
     inspector = scene_graph.model_inspector()
     corners = []
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1)
-    X_BW = plant.get_body(plant.GetBodyIndices(instances[0])[0]).EvalPoseInWorld(context).inverse()
-    for index in plant.GetBodyIndices(instances[0]):
-        for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
-            X_BG = X_BW @ plant.get_body(index).EvalPoseInWorld(context) @ inspector.GetPoseInFrame(geometry)
+    X_BW = bodies[0].EvalPoseInWorld(context).inverse()
+    for body in bodies:
+        for geometry in plant.GetCollisionGeometriesForBody(body):
+            X_BG = X_BW @ body.EvalPoseInWorld(context) @ inspector.GetPoseInFrame(geometry)
             obb = inspector.GetObbInGeometryFrame(geometry)
             if obb is None or not inspector.GetProximityProperties(geometry):
                 continue
             corners.append((X_BG @ obb.pose()).multiply(signs * obb.half_width()[:, None]))
     points = np.hstack(corners) if corners else None
+    names = [body.name() for body in bodies]
+    moving_names = [joint.name() for joint in moving if joint.num_positions() == 1]
     return ModelFacts(
         reference,
-        bodies,
+        tuple(plant.GetModelInstanceName(i).partition("::")[2] for i in instances if plant.GetBodyIndices(i)),
+        tuple(names),
         joints,
         rigid,
         None if points is None else points.min(axis=1),
         None if points is None else points.max(axis=1),
         frozenset(joint.name() for joint in moving if joint.type_name() == "prismatic"),
+        tuple(dict.fromkeys(n for known in (names, moving_names) for n in known if known.count(n) > 1)),
+        tuple(roots),
+        tuple(anchored),
     )
 
 

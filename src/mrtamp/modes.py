@@ -176,7 +176,7 @@ def condition_holds(
         if a.parent != region.body:
             return False
         p = (inverse(region.X_BS.GetAsMatrix4()) @ a.X_PO)[:2, 3]
-        return bool(np.all(np.abs(p) <= np.asarray(region.size) / 2 + POSITION_TOLERANCE))
+        return bool(np.all(np.abs(p) <= np.asarray(region.reach) + POSITION_TOLERANCE))
     if a.parent != condition.on:
         return False
     return condition.X_BO is None or _same_pose(a.X_PO, condition.X_BO.GetAsMatrix4())

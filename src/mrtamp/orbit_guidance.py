@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from mrtamp.graphs import Graphs
-from mrtamp.guidance import Choice, ModalGuidance
+from mrtamp.guidance import Choice, ModalGuidance, Outline
 from mrtamp.modes import Mode
 from mrtamp.tensor_tree import TensorTree
 
@@ -32,6 +32,7 @@ class OrbitGuidance:
     Attributes
     ----------
     path : orbits on the incumbent's path (L_O in the paper), as they were numbered when it was found.
+    guided : whether the transitions chosen last are those that guidance prefers; if not, nothing may be left out.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class OrbitGuidance:
         self.by_mode = by_mode
         self.along_path = along_path
         self.path: list[int] = []
+        self.guided = by_mode
 
     def choose(self, *, improving: bool) -> tuple[int, list[Choice]]:
         """Orbit to work in and the elementary transitions Gamma to sample there (one per robot, disjoint).
@@ -60,6 +62,7 @@ class OrbitGuidance:
         `improving` says whether there is a plan, whose path may be followed.
         """
         explore = self.rng.random() < self.persistent
+        self.guided = self.by_mode and not explore
         along = improving and self.along_path and self.rng.random() < 0.5
         if explore or not (along or self.by_mode):
             orbit = self.any_orbit()
@@ -69,8 +72,8 @@ class OrbitGuidance:
             orbit = self._modal_frontier()
         self.graphs.orbital.nodes[orbit]["visits"] += 1
         mode = self.graphs.mode(orbit)
-        self.graphs.modal.nodes[mode.state]["visits"] += 1
-        if explore or not self.by_mode:
+        self.modal.visit(mode)
+        if not self.guided:
             return orbit, self.modal.feasible_sets(mode, self.rng)
         return orbit, self._optimistic_choices(mode)
 
@@ -88,15 +91,16 @@ class OrbitGuidance:
         return orbits[int(self.rng.integers(len(orbits)))]
 
     def _modal_frontier(self) -> int:
-        """The orbit of the modal state that is optimistically nearest to the goal, visits held against it."""
+        """The orbit whose modes are optimistically nearest to the goal, visits to modes alike held against it."""
+        least: dict[Outline, tuple[int, int]] = {}
+        for orbit, nodes in self.tree.of_orbit.items():
+            if nodes:
+                outline = self.modal.outline(self.graphs.mode(orbit))
+                entry = (self.graphs.orbital.nodes[orbit]["visits"], orbit)
+                least[outline] = min(least.get(outline, entry), entry)
         best, chosen = np.inf, 0
-        for state, known in self.graphs.orbits_of.items():
-            orbits = [o for o in known if self.tree.of_orbit.get(o)]
-            if not orbits:
-                continue
-            visits = self.graphs.modal.nodes[state]["visits"]
-            orbit = min(orbits, key=lambda o: self.graphs.orbital.nodes[o]["visits"])
-            score = self.modal.remaining(self.graphs.mode(orbit)) + _VISIT * np.sqrt(visits)
+        for outline, (_, orbit) in least.items():
+            score = self.modal.remaining(self.graphs.mode(orbit)) + _VISIT * np.sqrt(self.modal.visits(outline))
             if score <= best:
                 best, chosen = score, orbit
         return chosen

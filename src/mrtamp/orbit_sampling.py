@@ -23,8 +23,6 @@ _COVER = 3200
 _GROWTH = 1.0
 """Roadmaps grow by at least so many times the square root of their size per iteration: in proportion to their size they
 would grow exponentially, and less and less exploration would fit into a second."""
-_PATIENCE = 4
-"""Failures of a transition in a mode after which guidance no longer insists on promising candidates."""
 
 
 class OrbitSampling:
@@ -89,19 +87,19 @@ class OrbitSampling:
         `improving` says whether there is a plan: from then on the sets of candidates grow every time.
         """
         lists = []
+        guided, leads_on = self.guidance.guided, self.guidance.modal.leads_on
         for choice in choices:
-            failed = self.guidance.modal.failed(mode, choice)
-            guided = len(choices) == 1 and failed < _PATIENCE
             known = known_candidates(self.sampler, mode, choice)
             if guided:
-                known = [c for c in known if c.promising and (improving or not self.growth.taken(mode, c))]
+                known = [c for c in known if leads_on(mode, choice, c)]
+                known = [c for c in known if improving or not self.growth.taken(mode, c)]
             # Grow the set while it is small, later in step with its logarithm, for ever.
             if len(known) < 4 or improving or self.rng.random() < 0.3 + self.persistent:
                 known = [
                     *(
                         c
                         for c in new_candidates(self.sampler, mode, choice, self.transition_samples)
-                        if c.promising or not guided
+                        if not guided or leads_on(mode, choice, c)
                     ),
                     *known,
                 ]
@@ -116,11 +114,13 @@ class OrbitSampling:
             return []
         out = []
         for _ in range(self.combinations):
-            pick = tuple(x[self._low_index(len(x))] for x in lists)
+            pick = tuple(x[self._index(len(x), guided)] for x in lists)
             if pick not in out:
                 out.append(pick)
         return out
 
-    def _low_index(self, n: int) -> int:
-        """An index below n, earlier ones more likely."""
+    def _index(self, n: int, guided: bool) -> int:
+        """An index below n, earlier ones more likely if `guided`: exploration gives every candidate the same chance."""
+        if not guided:
+            return int(self.rng.integers(n))
         return int(min(n - 1, self.rng.geometric(0.35) - 1))

@@ -25,6 +25,8 @@ from mrtamp.resting import FACES, bounding_box, face_down, face_normal, flat_fac
 REST_TOLERANCE = 0.001
 EDGE_TOLERANCE = 0.001
 TILT_TOLERANCE = np.radians(1.0)
+TOP_MARGIN = 0.01
+"""How far (m) from the edge of a whole top face origins stay, where the file does not say: there things would fall."""
 STEEPEST_SURFACE = np.radians(25.0)
 
 
@@ -81,7 +83,7 @@ class BodyFrames:
 
 def read_support(value: Value, frames: BodyFrames) -> Support:
     """One entry of `supports:`."""
-    entries = value.mapping(("name", "on"), ("X_BS", "size", "yaw_deg", "X_BO", "objects", "color"))
+    entries = value.mapping(("name", "on"), ("X_BS", "size", "margin", "yaw_deg", "X_BO", "objects", "color"))
     body = entries["on"].choice(frames.names, "bodies")
     top = frames.top(body)
     if top is None and not ("X_BS" in entries and "size" in entries):
@@ -98,7 +100,10 @@ def read_support(value: Value, frames: BodyFrames) -> Support:
         x, y = entries["size"].numbers(2, "[x, y] full sizes in metres", low=0.0)
         size = (x, y)
     _check_region(value, entries, body, X_BS, size, frames=frames)
-    support = Support(entries["name"].name(), body, X_BS, size)
+    margin = 0.0 if "size" in entries or "X_BO" in entries else TOP_MARGIN
+    if "margin" in entries:
+        margin = entries["margin"].number(low=0.0)
+    support = Support(entries["name"].name(), body, X_BS, size, margin=margin)
     if "yaw_deg" in entries:
         low, high = entries["yaw_deg"].numbers(2, "[least, most] in degrees", low=-360.0, high=360.0)
         if low > high:
@@ -258,11 +263,8 @@ def check_rest(
     standing = resting_pose(thing, face, (0.0, 0.0), 0.0, frames.package_paths)
     gap = float(X_SO.translation()[2] - standing.translation()[2])
     if abs(gap) > REST_TOLERANCE:
-        where = "above" if gap > 0 else "below"
-        raise value.error(
-            f"found {thing.name!r} {abs(gap):.4f} m {where} the top of {body!r}, expected it to rest on it "
-            f"({-gap:+.4f} m along the surface's normal)"
-        )
+        where = f"floating {gap:.3g} m above" if gap > 0 else f"{-gap:.3g} m too low on"
+        raise value.error(f"found {thing.name!r} {where} {body!r}, expected it to rest on the surface there")
     beside = float((np.abs(X_SO.translation()[:2]) - np.array(size) / 2).max())
     if beside > EDGE_TOLERANCE:
         raise value.error(f"found {thing.name!r} {beside:.3f} m beside {body!r}, expected its origin over the surface")
@@ -272,10 +274,12 @@ def _check_inside(value: Value, region: Support, X_BO: RigidTransform) -> None:
     if region.X_BO is not None:
         return
     p_SO = region.X_BS.inverse().multiply(X_BO.translation())
-    if (np.abs(p_SO[:2]) > np.array(region.size) / 2 + 1e-9).any():
+    x, y = region.reach
+    if (np.abs(p_SO[:2]) > np.array([x, y]) + 1e-9).any():
+        margin = f" less its margin of {region.margin:g} m" if region.margin else ""
         raise value.error(
-            f"found the position [{p_SO[0]:g}, {p_SO[1]:g}] in {region.name!r}, expected one inside it: "
-            f"|x| <= {region.size[0] / 2:g}, |y| <= {region.size[1] / 2:g}"
+            f"found the position [{p_SO[0]:g}, {p_SO[1]:g}] in {region.name!r}, expected one inside it{margin}: "
+            f"|x| <= {x:g}, |y| <= {y:g}"
         )
 
 

@@ -84,7 +84,7 @@ class Plan:
     """What there is to say about how it was found, beyond the seed."""
 
     def save(self, path: str | Path) -> None:
-        """Write the plan to a file that stands alone; see `mrtamp.plan_file.save_plan`."""
+        """Write the plan with its problem to a file; see `mrtamp.plan_file.save_plan`."""
         from mrtamp.plan_file import save_plan  # here, because the file format is built on this module
 
         save_plan(self, path)

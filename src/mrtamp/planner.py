@@ -9,12 +9,14 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from mrtamp.collision import Collision, Counts
 from mrtamp.coordination import coordinate
+from mrtamp.deadline import Deadline, TimeIsUp
 from mrtamp.effort import Effort
 from mrtamp.explain import explain
 from mrtamp.growth import Combination, Growth
@@ -38,6 +40,8 @@ from mrtamp.validity import Validity
 
 _SKELETON_TURN = 4
 """Before the first plan, every so many iterations skeletons have their turn."""
+_AHEAD = 1.0
+"""Work (s, or iterations where these bound a run) that skeletons may have had beyond search's before the first plan."""
 _WORTH_ADOPTING = 0.01
 """Relative gain over what the tree has for which a refined plan is put into it."""
 _RAREST = 5
@@ -96,6 +100,7 @@ class Planner:
         self._clock = time.perf_counter()
         self._spent = 0.0
         self.rng = np.random.default_rng(seed)
+        self.deadline = Deadline()
         self._counts = Counts()
         self.collision = Collision(problem, self._counts)
         self.roadmaps = roadmaps_of(problem, self.collision)
@@ -104,7 +109,7 @@ class Planner:
         for roadmap in self.roadmaps.values():
             roadmap.inserted = None if self._uses("lazy-validation") else self.validity.insert
         self.sampler = TransitionSampler(problem, self.collision, self.roadmaps, self.validity, self.rng)
-        self.growth = Growth(problem, self.roadmaps, self.validity, self.rng, self.options.intra_orbit)
+        self.growth = Growth(problem, self.roadmaps, self.validity, self.rng, self.options.intra_orbit, self.deadline)
         self.graphs, self.tree = self.growth.graphs, self.growth.tree
         self.guidance = ModalGuidance(problem, self.sampler, self.graphs)
         self.orbit_guidance = OrbitGuidance(
@@ -136,7 +141,7 @@ class Planner:
         self.sampler.remember(mode)
         self.root = self.growth.start(mode)
         self.sampling.cover(self.options.initial_vertices)
-        self.skeletons = SkeletonGuidance(problem, self.sampler, self.guidance, mode)
+        self.skeletons = SkeletonGuidance(problem, self.sampler, self.guidance, mode, self.deadline)
         self.portfolio = Portfolio(
             problem,
             self.collision,
@@ -158,10 +163,12 @@ class Planner:
             drafts=self._uses("drafts"),
         )
         self._effort = Effort(
-            {"search": 0.05, "skeletons": 0.2, "refinement": 0.1},
+            {"search": 0.05, "skeletons": 0.25, "refinement": 0.1},
             {"search": 0.0, "skeletons": 0.1, "refinement": 0.9},
             {"refinement": self.options.refinement_share},
         )
+        # Work before the first plan.
+        self._tried = dict.fromkeys(("search", "skeletons"), 0.0)
         self._timed = True
         self.bound: Callable[[], float] = lambda: np.inf
         """Cost of a plan that is known elsewhere; what does not promise to beat it is not worked on."""
@@ -186,37 +193,40 @@ class Planner:
 
         Parameters
         ----------
-        budget_s : seconds of planning in this call.  iterations : iterations in this call.  `None`: no bound.
-        first : stop after the first plan.
+        budget_s : seconds of planning in this call; what is under way then is abandoned within a fraction of a second.
+        iterations : iterations in this call.  `None`: no bound.
+        first : stop after the first plan.  A plan of cost 0 ends every call: none is better.
         progress : called with a `Status` after every iteration.
         """
         self._clock = time.perf_counter() - self._spent
-        end = np.inf if budget_s is None else time.perf_counter() + budget_s
+        self.deadline.set(budget_s)
         stop = np.inf if iterations is None else self.iteration + iterations
         self._timed = iterations is None
+        activities = {"search": self._search, "skeletons": self._realise_skeletons, "refinement": self._refine}
         try:
-            while time.perf_counter() < end and self.iteration < stop:
+            while not self.deadline.passed and self.iteration < stop and self._to_beat() > 0:
                 activity = self._next_activity()
                 began, before = time.perf_counter(), self._cost()
-                better = {"search": self._search, "skeletons": self._realise_skeletons, "refinement": self._refine}[
-                    activity
-                ]()
+                with suppress(TimeIsUp):
+                    activities[activity]()
                 self.iteration += 1
                 work = time.perf_counter() - began if self._timed else 1.0
                 if np.isfinite(before):
                     self._effort.record(activity, work, before - self._cost())
+                else:
+                    self._tried[activity] += work
                 self._spent = self._elapsed()
                 if progress is not None:
                     progress(self.status())
-                if better:
+                if self._cost() < before:
                     yield self._incumbent()
                     if first:
                         return
         finally:
             self._spent = self._elapsed()
 
-    def _search(self) -> bool:
-        """One iteration of the algorithm's loop; whether there is a better plan."""
+    def _search(self) -> None:
+        """One iteration of the algorithm's loop."""
         orbit, choices = self.orbit_guidance.choose(improving=self.best is not None)
         self.sampling.expand_roadmaps()
         mode = self.graphs.mode(orbit)
@@ -224,7 +234,7 @@ class Planner:
         for combination in candidates:
             self._discover_adjacent_orbit(mode, combination)
         self._extend_tree(orbit, choices, candidates)
-        return self._best_solution()
+        self._best_solution()
 
     def _discover_adjacent_orbit(self, mode: Mode, combination: Combination) -> None:
         """Note the modal state that a sampled transition leads to."""
@@ -235,7 +245,9 @@ class Planner:
         """Before the first plan search and skeletons in turn; then what is behind its share."""
         skeletons = self._uses("skeletons") and self.skeletons.applies and self.iteration >= self._skeletons_from
         if self.best is None:
-            return "skeletons" if skeletons and self.iteration % _SKELETON_TURN == 0 else "search"
+            # Attempts that take long, and fail, leave search its half of the time.
+            turn = self.iteration % _SKELETON_TURN == 0 and self._tried["skeletons"] <= self._tried["search"] + _AHEAD
+            return "skeletons" if skeletons and turn else "search"
         refine = self._uses("refinement") and not self.portfolio.idle(self._to_beat())
         if skeletons and refine and self.realisation.undrafted:
             return "skeletons"
@@ -307,21 +319,21 @@ class Planner:
 
     # -- skeletons ------------------------------------------------------------------------------------------------
 
-    def _realise_skeletons(self) -> bool:
-        """Let the cheapest skeletons that may beat the incumbent have their turn; whether there is a better plan."""
+    def _realise_skeletons(self) -> None:
+        """Let the cheapest skeletons that may beat the incumbent have their turn."""
         if self.best is not None:
             self.sampling.expand_roadmaps()
         found = self.realisation.attempt()
         if isinstance(found, Node):
-            return self._solution(found)
-        return found is not None and self._adopt(found)
+            self._solution(found)
+        elif found is not None:
+            self._adopt(found)
 
-    def _adopt(self, plan: Plan) -> bool:
+    def _adopt(self, plan: Plan) -> None:
         """A checked plan that the tree does not have yet: into the tree, and under refinement."""
-        better = self._offer(plan)
+        self._offer(plan)
         if self._found(plan) and self._uses("adoption"):
             self._graft(plan)
-        return better
 
     def _found(self, plan: Plan) -> bool:
         """There is a plan: it is refined, and from now on the tree is rewired; whether it is a new one."""
@@ -341,20 +353,20 @@ class Planner:
 
     # -- solutions ------------------------------------------------------------------------------------------------
 
-    def _best_solution(self) -> bool:
+    def _best_solution(self) -> None:
         """Extract the cheapest plan of the tree when it beats what the tree gave before."""
         while True:
             growth = self.growth
             growth.goal_nodes = [n for n in growth.goal_nodes if n.alive]
             node = min(growth.goal_nodes, key=lambda n: n.cost, default=None)
             if node is None or node.cost >= self._tree_cost - 1e-9:
-                return False
+                return
             cost = node.cost
             if self._solution(node):
                 self._tree_cost = cost
                 if node.alive:
                     growth.without_detours(self.root, node)
-                return True
+                return
             if node.alive:
                 self._tree_cost = cost
 
@@ -382,15 +394,15 @@ class Planner:
         self._found(plan)
         return better
 
-    def _refine(self) -> bool:
-        """Give refinement its turn; whether there is a better plan."""
+    def _refine(self) -> None:
+        """Give refinement its turn."""
         plan = self.portfolio.improve(self._to_beat())
-        better = plan is not None and self._offer(plan)
+        if plan is not None:
+            self._offer(plan)
         for settled in self.portfolio.settled() if self._uses("adoption") else []:
             self.skeletons.learn(settled)
             if settled.cost < self._tree_cost * (1 - _WORTH_ADOPTING):
                 self._graft(settled)
-        return better
 
     # -- reports --------------------------------------------------------------------------------------------------
 
@@ -407,7 +419,7 @@ class Planner:
     @property
     def sampled_bound(self) -> float | None:
         """No plan over the transitions sampled so far costs less; None where skeletons say nothing."""
-        return self.skeletons.bound
+        return self.skeletons.bound or None
 
     def counts(self) -> dict[str, int]:
         """What was done, in numbers that do not depend on the machine: collision checks, IK calls and more."""

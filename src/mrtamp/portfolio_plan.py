@@ -34,8 +34,9 @@ _PERIOD_S = 0.3
 """Seconds between two looks of a seed at the bound, and between two plans that it sends."""
 _PULSE_S = 1.0
 """Seconds between two reports of a seed that has no news."""
-_GRACE_S = 1.0
-"""Seconds that seeds get, beyond the budget, to finish the iteration they are in and send their last plan."""
+_GRACE_S = 30.0
+"""Seconds beyond the budget after which a seed is given up: until then it has built its planner, planned, and said how
+that went, however busy its machine is."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ class Messenger:
 
 def plan_seed(order: Order) -> SeedReport:
     """Plan with one seed; plans are sent as they are found.  A task of `mrtamp.cluster`."""
-    began, own = time.monotonic(), link()
+    own = link()
     try:
         planner = make_planner(order.planner, problem_from_dict(order.problem), order.seed, order.options)
     except MrtampError as error:
@@ -155,9 +156,10 @@ def plan_seed(order: Order) -> SeedReport:
             messenger.send()
             messenger.pulse(planner.best.cost if planner.best is not None else None)
 
-        left = None if order.budget_s is None else max(order.budget_s - (time.monotonic() - began), 0.0)
         with suppress(_Unwanted):
-            for plan in planner.improve(left, iterations=order.iterations, first=order.first, progress=progress):
+            for plan in planner.improve(
+                order.budget_s, iterations=order.iterations, first=order.first, progress=progress
+            ):
                 messenger.offer(plan)
         messenger.send(last=True)
     best = planner.best
@@ -227,11 +229,10 @@ class SeedPortfolio:
 
         Parameters
         ----------
-        budget_s : seconds by the clock since the call.  What it takes to start the workers (a few seconds for processes
-            of this machine) and to build the planners is part of it; seeds plan in what is left, and get up to a second
-            more to finish the iteration that they are in.
+        budget_s : seconds of planning of every seed.  They count from when all workers have started (which takes a few
+            seconds for processes of this machine) and the seed has built its planner; the call takes that much longer.
         iterations : of every seed.
-        first : stop after the first plan of any seed.
+        first : stop after the first plan of any seed.  A plan of cost 0 ends the call in any case.
         progress : called with a line that says how far the seeds are.
 
         Raises
@@ -239,7 +240,6 @@ class SeedPortfolio:
         MrtampError : the problem cannot be planned, or there are not enough workers.
         RuntimeError : all seeds failed; the message has the traceback of one.
         """
-        began = time.monotonic()
         self.reports.clear()
         self.failures.clear()
         self._costs = dict.fromkeys(self.seeds)
@@ -248,34 +248,30 @@ class SeedPortfolio:
                 raise MrtampError(
                     f"{len(self.seeds)} seeds side by side need as many workers; {self.scheduler} has {workers.size}"
                 )
-            for plan in self._found(workers, began, budget_s, iterations, first):
+            for plan in self._found(workers, budget_s, iterations, first):
                 if plan is not None:
                     yield plan
-                    if first:
+                    if first or plan.cost == 0:
                         return
                 if progress is not None:
-                    progress(self._status())
+                    progress(self.status())
         if len(self.failures) == len(self.seeds) and self.best is None:
             raise RuntimeError(next(iter(self.failures.values())))
 
     def _found(
-        self, workers: Pool, began: float, budget_s: float | None, iterations: int | None, first: bool
+        self, workers: Pool, budget_s: float | None, iterations: int | None, first: bool
     ) -> Iterator[Plan | None]:
         """Every better plan, and None whenever there is other news."""
         from distributed import Variable
 
         bound = Variable(f"mrtamp-bound-{uuid.uuid4().hex}", workers.client)
         bound.set(self.best.cost if self.best is not None else np.inf)
-        problem = problem_to_dict(self.problem)
-
-        def left() -> float | None:
-            return None if budget_s is None else max(budget_s - (time.monotonic() - began), 0.0)
-
+        problem, began = problem_to_dict(self.problem), time.monotonic()
         tasks = (
-            (str(s), (Order(problem, s, self.planner, self.options, left(), iterations, first, bound.name),))
+            (str(s), (Order(problem, s, self.planner, self.options, budget_s, iterations, first, bound.name),))
             for s in self.seeds
         )
-        limit = None if budget_s is None else budget_s - (time.monotonic() - began) + _GRACE_S
+        limit = None if budget_s is None else budget_s + _GRACE_S
         try:
             for event in workers.follow(plan_seed, tasks, limit_s=limit):
                 seed = int(event.key)
@@ -314,7 +310,8 @@ class SeedPortfolio:
         self.reports[seed] = report
         self._costs[seed] = report.cost
 
-    def _status(self) -> str:
+    def status(self) -> str:
+        """How far the seeds are, in one line."""
         solved = sum(cost is not None for cost in self._costs.values())
         if self.best is None:
             return f"first plan: {len(self.seeds)} seeds side by side"
@@ -326,7 +323,7 @@ class SeedPortfolio:
     @property
     def sampled_bound(self) -> float | None:
         """The least of the seeds' sampled bounds; None as long as no seed has reported one."""
-        known = [r.sampled_bound for r in self.reports.values() if r.sampled_bound]
+        known = [r.sampled_bound for r in self.reports.values() if r.sampled_bound is not None]
         return min(known, default=None)
 
     def counts(self) -> dict[str, int]:
@@ -364,7 +361,7 @@ def plan_portfolio(
     Parameters
     ----------
     seeds : of the planners, all different; each has a process of its own.
-    budget_s : seconds by the clock, the start of the workers included, see `SeedPortfolio.improve`.
+    budget_s : seconds of planning of every seed, the start of the workers not included, see `SeedPortfolio.improve`.
     scheduler : address of a Dask scheduler, as in `tcp://host:8786`; None: this machine.
     on_better : called with every plan that is better than all before it.
 

@@ -108,8 +108,9 @@ class Support:
     """A named region on a body (static, or an object) where things may be put.
 
     `X_BS` is the surface frame S in the body B: origin in the middle, z out of the surface.  An object is *in*
-    the region when its origin lies within `size` (full sizes along x, y of S).  With `X_BO` the support is one
-    exact pose of the object in B.  `objects` restricts who may be put there (None: any).
+    the region when its origin lies within `size` (full sizes along x, y of S) and at least `margin` (m) from the rim;
+    where that leaves nothing, in the middle.  With `X_BO` the support is one exact pose of the object in B.  `objects`
+    restricts who may be put there (None: any).
     """
 
     name: str
@@ -120,6 +121,12 @@ class Support:
     X_BO: RigidTransform | None = None
     objects: tuple[str, ...] | None = None
     color: tuple[float, float, float, float] | None = None
+    margin: float = 0.0
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """How far (m) from the middle, along x and y of S, the origin of an object in the region may be."""
+        return max(self.size[0] / 2 - self.margin, 0.0), max(self.size[1] / 2 - self.margin, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,19 +137,25 @@ class AntipodalGrasps:
     perpendicular to it (a box: one of the other two axes, whose extent must fit the gripper; a cylinder approached
     along its axis or its side: every angle in between).  The grasp point slides along the face by up to `offset` (m,
     each way, along the remaining axis) and sinks `depth` (m) from the object's near face towards its far face: a range.
+    `robots` says which robots may grasp so (None: all).
     """
 
     approaches: tuple[str, ...]
     offset: float
     depth: tuple[float, float]
+    robots: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ExplicitGrasp:
-    """One grasp frame pose in the object frame, with the opening width of the fingers when closed on it (m)."""
+    """One grasp frame pose in the object frame, with the opening width of the fingers when closed on it (m).
+
+    `robots` says which robots may grasp so (None: all).
+    """
 
     X_OG: RigidTransform
     width: float
+    robots: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +179,7 @@ class MovableObject:
 
 @dataclass(frozen=True)
 class InRegion:
-    """Goal: `object` rests with its origin inside the support `region`."""
+    """Goal: `object` rests with its origin inside the support `region`, `Support.margin` away from the rim."""
 
     object: str
     region: str

@@ -82,6 +82,8 @@ def load_problem(source: str | Path | dict[str, Any], **params: int) -> Problem:
     shipped = _shipped_problems()
     file = shipped.get(name, Path(source).expanduser())
     if name not in shipped and not file.is_file():
+        if file.is_dir():
+            raise ProblemError(f"found {name!r}, expected a problem file ({file.resolve()} is a directory)")
         if "/" in name or name.endswith((".yaml", ".yml")):
             raise ProblemError(f"found {name!r}, expected an existing problem file (there is no {file.resolve()})")
         valid = choices([*shipped, *generators], name, "shipped problems")
@@ -141,11 +143,11 @@ class _Reader:
         self.root = document.root
         # Subgoals are a goal, too.
         visits = isinstance(self.root.data, dict) and bool(self.root.data.get("subgoals"))
-        required = ("mrtamp", "name", "robots") if visits else ("mrtamp", "name", "robots", "goal")
+        goal = ("goal",)
         self.entries = self.root.mapping(
-            required,
+            ("mrtamp", "name", "robots", *(() if visits else goal)),
             (
-                "goal",
+                *(goal if visits else ()),
                 "description",
                 "packages",
                 "world",
@@ -171,8 +173,8 @@ class _Reader:
         object_values = self._named("objects")
         support_values = self._named("supports")
         subgoal_values = self._named("subgoals")
-        max_width = max((r.model.gripper.max_width for r in robots if r.model.gripper), default=0.0)
-        objects = [self._object(value, max_width) for value in object_values]
+        openings = {r.name: r.model.gripper.max_width if r.model.gripper else 0.0 for r in robots}
+        objects = [self._object(value, openings) for value in object_values]
         frames = BodyFrames(statics, {o.name: o for o in objects}, self.packages)
         regions = [read_support(value, frames) for value in support_values]
         objects, starts = self._starts(object_values, objects, regions, frames)
@@ -243,12 +245,14 @@ class _Reader:
             return _shape(entries["shape"]), None
         try:
             model = resolve_model(entries["model"].text(), value.document.directory, self.packages)
-            model_facts(model, self.packages)
+            facts = model_facts(model, self.packages)
         except ProblemError as error:
             raise entries["model"].error(str(error)) from None
+        if len(facts.models) > 1:
+            raise entries["model"].error(f"{model} holds the models {', '.join(facts.models)}, expected one")
         return None, model
 
-    def _object(self, value: Value, max_width: float) -> MovableObject:
+    def _object(self, value: Value, openings: dict[str, float]) -> MovableObject:
         """The object, its start still at the world's origin: starts may refer to objects further down the file."""
         entries = value.mapping(("name", "start"), ("shape", "model", "mass", "color", "resting_faces", "grasps"))
         shape, model = self._solid(value, entries)
@@ -271,7 +275,7 @@ class _Reader:
             shape=shape,
             model=model,
             resting_faces=faces,
-            grasps=read_grasps(entries.get("grasps"), value, shape, max_width),
+            grasps=read_grasps(entries.get("grasps"), value, shape, openings),
             **optional,
         )
 

@@ -12,6 +12,7 @@ from mrtamp.problem import (
     AtConfiguration,
     AtPose,
     Condition,
+    ExplicitGrasp,
     HandAt,
     HeldBy,
     InRegion,
@@ -98,6 +99,8 @@ def _support(support: Support) -> dict[str, Any]:
         "X_BS": pose_to_dict(support.X_BS),
         "size": list(support.size),
     }
+    if support.margin:
+        data["margin"] = support.margin
     if support.yaw != (-np.pi, np.pi):
         data["yaw_deg"] = np.degrees(support.yaw).tolist()
     if support.X_BO is not None:
@@ -121,13 +124,20 @@ def _object(thing: MovableObject) -> dict[str, Any]:
         "color": list(thing.color),
         "start": start,
         "resting_faces": list(thing.resting_faces),
-        "grasps": [
-            {"antipodal": {"approach": list(grasp.approaches), "offset": grasp.offset, "depth": list(grasp.depth)}}
-            if isinstance(grasp, AntipodalGrasps)
-            else {"X_OG": pose_to_dict(grasp.X_OG), "width": grasp.width}
-            for grasp in thing.grasps
-        ],
+        "grasps": [_grasp(grasp) for grasp in thing.grasps],
     }
+
+
+def _grasp(grasp: AntipodalGrasps | ExplicitGrasp) -> dict[str, Any]:
+    data: dict[str, Any]
+    if isinstance(grasp, AntipodalGrasps):
+        family = {"approach": list(grasp.approaches), "offset": grasp.offset, "depth": list(grasp.depth)}
+        data = {"antipodal": family}
+    else:
+        data = {"X_OG": pose_to_dict(grasp.X_OG), "width": grasp.width}
+    if grasp.robots is not None:
+        data["robots"] = list(grasp.robots)
+    return data
 
 
 def _subgoal(subgoal: Subgoal) -> dict[str, Any]:

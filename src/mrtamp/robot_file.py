@@ -76,6 +76,7 @@ def read_robot(document: Document, package_paths: tuple[Path, ...] = (), file: P
         facts = model_facts(model, package_paths)
     except ProblemError as error:
         raise entries["model"].error(str(error)) from None
+    _check_whole(entries["model"], facts)
     arm_joints = tuple(
         item.choice(facts.joints, "moving joints of the model") for item in entries["arm_joints"].items()
     )
@@ -103,6 +104,24 @@ def read_robot(document: Document, package_paths: tuple[Path, ...] = (), file: P
         collision_exceptions=_exceptions(entries.get("collision_exceptions"), facts),
         file=file,
     )
+
+
+def _check_whole(value: Value, facts: ModelFacts) -> None:
+    """The models of the file are one robot that stands free, and no two of its parts have the same name."""
+    if facts.repeated:
+        raise value.error(
+            f"found several bodies or joints named {', '.join(facts.repeated)} (in the models "
+            f"{', '.join(facts.models)}), expected different names within one robot"
+        )
+    if facts.anchored:
+        raise value.error(
+            f"found {facts.anchored[0]!r} fixed to the world, expected a model that stands free: X_WB in the problem "
+            "fixes its base"
+        )
+    if len(facts.roots) > 1:
+        raise value.error(
+            f"found parts that nothing connects ({', '.join(facts.roots)}), expected joints or welds between them"
+        )
 
 
 def _gripper(value: Value, arm_joints: tuple[str, ...], facts: ModelFacts) -> Gripper:

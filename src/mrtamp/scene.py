@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import (
@@ -25,12 +24,14 @@ from pydrake.geometry import Shape as DrakeShape
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, RigidBody, SpatialInertia, UnitInertia
+from pydrake.multibody.tree import Joint, ModelInstanceIndex, RigidBody, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from mrtamp.kinematics import Chain, Tool, quaternions
-from mrtamp.model_files import make_parser
+from mrtamp.model_files import add_models, make_parser
 from mrtamp.problem import MovableObject, MrtampError, Problem, Robot, RobotModel, Shape, StaticBody
+
+Instances = tuple[ModelInstanceIndex, ...]
 
 
 def drake_shape(shape: Shape) -> DrakeShape:
@@ -41,10 +42,13 @@ def drake_shape(shape: Shape) -> DrakeShape:
 
 @dataclass
 class RobotInScene:
-    """Where one robot lives in a plant: its model instance and the columns of q that are its arm and its fingers."""
+    """Where one robot lives in a plant: its model instances and the columns of q that are its arm and its fingers.
+
+    An arm and its gripper may be two instances; their bodies have different names.
+    """
 
     robot: Robot
-    instance: ModelInstanceIndex
+    instances: Instances
     arm: np.ndarray
     fingers: np.ndarray
     finger_factors: np.ndarray
@@ -87,18 +91,6 @@ class Scene:
         q[k + 4 : k + 7] = X_WF[:3, 3]
 
 
-def parse_robot(parser: Parser, model: RobotModel, name: str) -> ModelInstanceIndex:
-    """Add the robot's URDF or SDF under the instance name `name` and return its (single) model instance."""
-    if model.model.startswith("package://"):
-        instances = parser.AddModelsFromUrl(model.model)
-    else:
-        root = model.file.parent if model.file else Path()
-        instances = parser.AddModels(str((root / model.model).resolve()))
-    if len(instances) != 1:
-        raise MrtampError(f"{model.model}: expected one model, found {len(instances)}")
-    return instances[0]
-
-
 def _add_primitive(plant: MultibodyPlant, body: RigidBody, shape: Shape, color: Sequence[float], visuals: bool) -> None:
     geometry = drake_shape(shape)
     plant.RegisterCollisionGeometry(body, RigidTransform(), geometry, "collision", CoulombFriction(0.9, 0.8))
@@ -124,18 +116,19 @@ def _add_static(plant: MultibodyPlant, parser: Parser, static: StaticBody, visua
         _add_primitive(plant, body, static.shape, static.color, visuals)
         plant.WeldFrames(plant.world_frame(), body.body_frame(), static.X_WB)
         return [body]
-    return _add_model(plant, parser, static.model or "", static.X_WB)
+    return _add_model(plant, parser, static.model or "", f"static:{static.name}", static.X_WB)
 
 
-def _add_model(plant: MultibodyPlant, parser: Parser, model: str, X_WB: RigidTransform | None) -> list[RigidBody]:
+def _add_model(
+    plant: MultibodyPlant, parser: Parser, model: str, owner: str, X_WB: RigidTransform | None
+) -> list[RigidBody]:
     """A model file of fixed bodies; welded at X_WB, or left free (an object) when X_WB is None."""
-    url = model.startswith("package://")
-    [instance] = parser.AddModelsFromUrl(model) if url else parser.AddModels(model)
-    bodies = [plant.get_body(i) for i in plant.GetBodyIndices(instance)]
-    if X_WB is not None and not plant.GetJointIndices(instance):
+    instances = add_models(plant, parser, model, owner)
+    bodies, joints = _bodies(plant, instances), _joints(plant, instances)
+    if X_WB is not None and not joints:
         plant.WeldFrames(plant.world_frame(), bodies[0].body_frame(), X_WB)
     elif X_WB is not None:
-        children = {plant.get_joint(j).child_body().name() for j in plant.GetJointIndices(instance)}
+        children = {joint.child_body().name() for joint in joints}
         roots = [b for b in bodies if b.name() not in children]
         if roots:
             plant.WeldFrames(plant.world_frame(), roots[0].body_frame(), X_WB)
@@ -171,14 +164,13 @@ def build_scene(
     builder = builder or DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     parser = make_parser(plant, scene_graph, problem.package_paths)
-    parser.SetAutoRenaming(True)
 
     included = {name: problem.robot(name) for name in (robots or [r.name for r in problem.robots])}
-    instances: dict[str, ModelInstanceIndex] = {}
+    instances: dict[str, Instances] = {}
     for name, robot in included.items():
-        instance = parse_robot(parser, robot.model, name)
-        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(robot.model.base, instance), robot.X_WB)
-        instances[name] = instance
+        instances[name] = add_models(plant, parser, _model_file(robot.model), name)
+        base = _body(plant, instances[name], robot.model.base)
+        plant.WeldFrames(plant.world_frame(), base.body_frame(), robot.X_WB)
     static_bodies = {s.name: _add_static(plant, parser, s, visuals) for s in problem.statics} if statics else {}
     free = {o.name: o for o in problem.objects} if free_bodies is None else dict(free_bodies)
     bodies: dict[str, list[RigidBody]] = {}
@@ -189,16 +181,14 @@ def build_scene(
             _add_primitive(plant, body, item.shape, item.color, visuals)
             bodies[name] = [body]
         else:
-            bodies[name] = _add_model(plant, parser, item.model or "", None)
+            bodies[name] = _add_model(plant, parser, item.model or "", f"object:{name}", None)
     plant.Finalize()
-    _filter_exceptions(plant, scene_graph, included, instances)
+    in_scene = {name: _robot_in_scene(plant, robot, instances[name]) for name, robot in included.items()}
+    _filter_exceptions(plant, scene_graph, in_scene)
     grown = {
-        g: extra
-        for name, extra in (padding or {}).items()
-        for g in _pad(plant, scene_graph, included[name], instances[name], extra)
+        g: extra for name, extra in (padding or {}).items() for g in _pad(plant, scene_graph, in_scene[name], extra)
     }
 
-    in_scene = {name: _robot_in_scene(plant, robot, instances[name]) for name, robot in included.items()}
     scene = Scene(
         diagram=builder.Build() if own_builder else None,
         plant=plant,
@@ -215,15 +205,22 @@ def build_scene(
     return scene
 
 
-def _robot_in_scene(plant: MultibodyPlant, robot: Robot, instance: ModelInstanceIndex) -> RobotInScene:
+def _model_file(model: RobotModel) -> str:
+    """The URDF, SDF or directives of a robot: a URL, or a path that starts at the robot's own file."""
+    if model.model.startswith("package://") or model.file is None:
+        return model.model
+    return str((model.file.parent / model.model).resolve())
+
+
+def _robot_in_scene(plant: MultibodyPlant, robot: Robot, instances: Instances) -> RobotInScene:
     def columns(names: Iterable[str]) -> np.ndarray:
-        return np.array([plant.GetJointByName(j, instance).position_start() for j in names], dtype=int)
+        return np.array([_joint(plant, instances, j).position_start() for j in names], dtype=int)
 
     gripper = robot.model.gripper
     fingers = gripper.joints if gripper else {}
     return RobotInScene(
         robot=robot,
-        instance=instance,
+        instances=instances,
         arm=columns(robot.model.arm_joints),
         fingers=columns(fingers),
         finger_factors=np.array(list(fingers.values()), dtype=float),
@@ -237,12 +234,43 @@ def geometry_ids(plant: MultibodyPlant, bodies: Iterable[RigidBody]) -> list:
 
 def robot_bodies(plant: MultibodyPlant, in_scene: RobotInScene) -> list[RigidBody]:
     """All bodies of a robot."""
-    return [plant.get_body(i) for i in plant.GetBodyIndices(in_scene.instance)]
+    return _bodies(plant, in_scene.instances)
+
+
+def robot_joints(plant: MultibodyPlant, in_scene: RobotInScene) -> list[Joint]:
+    """All joints of a robot, welds included."""
+    return _joints(plant, in_scene.instances)
+
+
+def robot_body(plant: MultibodyPlant, in_scene: RobotInScene, name: str) -> RigidBody:
+    """The body of a robot called `name`."""
+    return _body(plant, in_scene.instances, name)
+
+
+def robot_joint(plant: MultibodyPlant, in_scene: RobotInScene, name: str) -> Joint:
+    """The joint of a robot called `name`."""
+    return _joint(plant, in_scene.instances, name)
+
+
+def _bodies(plant: MultibodyPlant, instances: Instances) -> list[RigidBody]:
+    return [plant.get_body(i) for instance in instances for i in plant.GetBodyIndices(instance)]
+
+
+def _joints(plant: MultibodyPlant, instances: Instances) -> list[Joint]:
+    return [plant.get_joint(i) for instance in instances for i in plant.GetJointIndices(instance)]
+
+
+def _body(plant: MultibodyPlant, instances: Instances, name: str) -> RigidBody:
+    return next(body for body in _bodies(plant, instances) if body.name() == name)
+
+
+def _joint(plant: MultibodyPlant, instances: Instances, name: str) -> Joint:
+    return next(joint for joint in _joints(plant, instances) if joint.name() == name and joint.num_positions())
 
 
 def gripper_bodies(plant: MultibodyPlant, in_scene: RobotInScene) -> list[RigidBody]:
     """The bodies of a robot that may touch what it holds; without a gripper the one that carries its grasp frame."""
-    return [plant.GetBodyByName(b, in_scene.instance) for b in touching_bodies(in_scene.robot.model)]
+    return [robot_body(plant, in_scene, b) for b in touching_bodies(in_scene.robot.model)]
 
 
 def touching_bodies(model: RobotModel) -> tuple[str, ...]:
@@ -267,17 +295,12 @@ def bodies_of(scene: Scene, thing: str) -> list[RigidBody]:
     return [b for name, bodies in scene.free_bodies.items() if scene.stands_for[name] == thing for b in bodies]
 
 
-def _filter_exceptions(
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    robots: Mapping[str, Robot],
-    instances: Mapping[str, ModelInstanceIndex],
-) -> None:
+def _filter_exceptions(plant: MultibodyPlant, scene_graph: SceneGraph, robots: Mapping[str, RobotInScene]) -> None:
     """Apply the collision exceptions of every robot description; its base may stand on the static world."""
     manager = scene_graph.collision_filter_manager()
-    for name, robot in robots.items():
-        for a, b in robot.model.collision_exceptions:
-            sets = [GeometrySet(geometry_ids(plant, [plant.GetBodyByName(x, instances[name])])) for x in (a, b)]
+    for in_scene in robots.values():
+        for pair in in_scene.robot.model.collision_exceptions:
+            sets = [GeometrySet(geometry_ids(plant, [robot_body(plant, in_scene, x)])) for x in pair]
             manager.Apply(CollisionFilterDeclaration().ExcludeBetween(*sets))
 
 
@@ -293,9 +316,7 @@ def _filter_ignored(scene: Scene, problem: Problem) -> None:
         manager.Apply(CollisionFilterDeclaration().ExcludeBetween(*sets))
 
 
-def _pad(
-    plant: MultibodyPlant, scene_graph: SceneGraph, robot: Robot, instance: ModelInstanceIndex, extra: float
-) -> list[GeometryId]:
+def _pad(plant: MultibodyPlant, scene_graph: SceneGraph, in_scene: RobotInScene, extra: float) -> list[GeometryId]:
     """Grow a robot's primitive collision shapes, so that motion between checked samples is covered too; returns them.
 
     Changing a shape drops the filters Drake had set for it (same body, adjacent bodies): the caller excludes the
@@ -303,11 +324,11 @@ def _pad(
     """
     source = plant.get_source_id()
     inspector = scene_graph.model_inspector()
-    gripper = set(robot.model.gripper.bodies) if robot.model.gripper else set()
+    model = in_scene.robot.model
+    gripper = set(model.gripper.bodies) if model.gripper else set()
     out = []
-    for index in plant.GetBodyIndices(instance):
-        body = plant.get_body(index)
-        if body.name() in gripper or body.name() == robot.model.base:
+    for body in robot_bodies(plant, in_scene):
+        if body.name() in gripper or body.name() == model.base:
             continue
         for g in plant.GetCollisionGeometriesForBody(body):
             shape = inspector.GetShape(g)
@@ -333,5 +354,5 @@ def chain_of(scene: Scene, name: str, width: float | None = None) -> tuple[Chain
     gripper = model.gripper
     opening = gripper.max_width if gripper and width is None else width
     fixed = {j: f * opening for j, f in gripper.joints.items()} if gripper and opening is not None else {}
-    chain = Chain(scene.plant, in_scene.instance, model.base, in_scene.robot.X_WB, model.arm_joints, fixed)
+    chain = Chain(robot_joints(scene.plant, in_scene), model.base, in_scene.robot.X_WB, model.arm_joints, fixed)
     return chain, Tool(chain, model.grasp_body, model.X_BG)

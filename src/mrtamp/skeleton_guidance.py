@@ -254,7 +254,8 @@ class SkeletonGuidance:
 
         def distance(robot: str, A: np.ndarray, B: np.ndarray) -> np.ndarray:
             rows, columns = ([vertex[robot, q.tobytes()] for q in X] for X in (A, B))
-            return np.array([[self._length(robot, a, b) for b in columns] for a in rows])
+            # A robot that takes part in no task has no stops.
+            return np.array([self._length(robot, a, b) for a in rows for b in columns]).reshape(len(A), len(B))
 
         return distance
 

@@ -24,7 +24,7 @@ from pydrake.systems.framework import DiagramBuilder
 from mrtamp.modes import start_mode
 from mrtamp.playback import Playback, standstill, static_poses
 from mrtamp.problem import AtConfiguration, AtPose, HandAt, HandIn, InRegion, Problem, Support
-from mrtamp.scene import build_scene, chain_of
+from mrtamp.scene import build_scene, chain_of, robot_joint
 
 PALETTE: tuple[tuple[float, float, float], ...] = (
     (0.00, 0.45, 0.70),
@@ -187,7 +187,7 @@ class Stage:
     def _slides(self, robot: str) -> bool:
         """Whether a robot moves from place to place: its first joint is prismatic."""
         model = self.problem.robot(robot).model
-        first = self.scene.plant.GetJointByName(model.arm_joints[0], self.scene.robots[robot].instance)
+        first = robot_joint(self.scene.plant, self.scene.robots[robot], model.arm_joints[0])
         return bool(first.type_name() == "prismatic")
 
     def _stands(self) -> np.ndarray:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from mrtamp.connect import Connector
+from mrtamp.deadline import Deadline
 from mrtamp.intra_orbit.lazy_validate import step_is_valid
 from mrtamp.modes import Mode
 from mrtamp.roadmap import Roadmap, lazy_path
@@ -34,18 +35,27 @@ Insert = Callable[[Node, At], Node]
 
 
 class Steering:
-    """Extends the tree towards roadmap vertices; every step it takes has been validated."""
+    """Extends the tree towards roadmap vertices; every step it takes has been validated.
+
+    Its searches raise `TimeIsUp` when the deadline has passed.
+    """
 
     def __init__(
-        self, roadmaps: Sequence[Roadmap], validity: Validity, insert: Insert, rng: np.random.Generator
+        self,
+        roadmaps: Sequence[Roadmap],
+        validity: Validity,
+        insert: Insert,
+        rng: np.random.Generator,
+        deadline: Deadline | None = None,
     ) -> None:
         self.roadmaps = list(roadmaps)
         self.validity = validity
         self.insert = insert
         self.rng = rng
+        self.deadline = deadline or Deadline()
         self.index = {g.name: i for i, g in enumerate(roadmaps)}
         self.trouble: Counter[tuple[str, str]] = Counter()
-        self.connector = Connector(validity, rng)
+        self.connector = Connector(validity, rng, self.deadline)
         self._sought: Counter[tuple] = Counter()
 
     def drive(self, node: Node, targets: Mapping[str, int], depth: int = 1) -> Node | None:
@@ -69,8 +79,9 @@ class Steering:
                 return at
         return None
 
-    def _go(self, node: Node, robot: str, goal: int, depth: int, rounds: int = ROUNDS) -> Node | None:
-        path, blockers = self.path(node.mode, node.at, robot, goal, rounds=rounds)
+    def _go(self, node: Node, robot: str, goal: int, depth: int, aside: bool = False) -> Node | None:
+        rounds = _ASIDE_ROUNDS if aside else ROUNDS
+        path, blockers = self.path(node.mode, node.at, robot, goal, rounds=rounds, connect=not aside)
         if path is not None:
             return self._follow(node, robot, path)
         if depth <= 0 or not blockers:
@@ -103,7 +114,7 @@ class Steering:
                 continue
             if not all(self.validity.against(robot, e, node.mode, other, v) for e in edges):
                 continue
-            moved = self._go(node, other, v, depth, _ASIDE_ROUNDS)
+            moved = self._go(node, other, v, depth, aside=True)
             if moved is not None:
                 return moved
         return None
@@ -117,12 +128,14 @@ class Steering:
         ignore: set[str] | None = None,
         rounds: int = ROUNDS,
         detour: bool = False,
+        connect: bool = True,
         seek: bool = False,
     ) -> tuple[list[int] | None, Counter[str]]:
         """Shortest valid path of one robot while the others stand, and how often each of those was in the way.
 
         `detour` asks for a path past a random vertex that is not far out of the way, where there is one: other ways
-        around things become plans too.  `seek`: where the roadmap lacks a way past standing robots, look for one.
+        around things become plans too.  `connect`: where the roadmap has no way, look for one; that is too much
+        for a robot that may as well go elsewhere.  `seek`: do so where it lacks only one past standing robots, too.
         """
         roadmap = self.roadmaps[self.index[robot]]
         start = at[self.index[robot]]
@@ -131,6 +144,7 @@ class Steering:
         blockers: Counter[str] = Counter()
 
         def validate(e: int) -> bool:
+            self.deadline.check()
             if not self.validity.edge(robot, e, mode):
                 self.trouble[robot, "world"] += 1
                 return False
@@ -153,7 +167,8 @@ class Steering:
             blocked = self.validity.blocked(robot, mode, standing)
         path = lazy_path(roadmap, start, goal, blocked, validate, rounds)
         others = {r: self.roadmaps[self.index[r]].q[v] for r, v in standing.items()} if seek else {}
-        if path is None and (seek or not blockers) and self._connects(roadmap, mode, start, goal, others):
+        wanted = seek or (connect and not blockers)
+        if path is None and wanted and self._connects(roadmap, mode, start, goal, others):
             blocked = self.validity.blocked(robot, mode, standing)
             path = lazy_path(roadmap, start, goal, blocked, validate, rounds)
         return path, blockers

@@ -18,7 +18,7 @@ from pydrake.geometry import Box, Cylinder
 
 from mrtamp.planar import shortest_path, visibility_graph
 from mrtamp.problem import AtConfiguration, MrtampError, Problem, RobotAt, Subgoal
-from mrtamp.scene import Scene, build_scene, robot_bodies
+from mrtamp.scene import Scene, build_scene, robot_bodies, robot_joint
 
 START = "start"
 END = "end"
@@ -83,7 +83,7 @@ def _legs(problem: Problem, scene: Scene, name: str, clearance: float) -> _Legs:
         if isinstance(condition, RobotAt) and condition.robot == name:
             sites[END] = condition.q
     radius, height = _disc(problem, scene, name)
-    joints = [scene.plant.GetJointByName(j, scene.robots[name].instance) for j in robot.model.arm_joints]
+    joints = [robot_joint(scene.plant, scene.robots[name], j) for j in robot.model.arm_joints]
     room = tuple(
         base + [limit(j) for j in joints]
         for limit in (lambda j: j.position_lower_limit(), lambda j: j.position_upper_limit())

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from flatland import WEIGHTS, Flatland, Setting, grid, product_graph, roadmap, step_free
 
+from mrtamp.deadline import Deadline
 from mrtamp.intra_orbit.planners import INTRA_ORBIT, IntraOrbitPlanner
 from mrtamp.roadmap import Roadmap
 from mrtamp.tensor_tree import At, Node
@@ -18,7 +19,7 @@ NAMES = sorted(INTRA_ORBIT)
 
 def planner(name: str, setting: Setting, seed: int = 0) -> IntraOrbitPlanner:
     rng = np.random.default_rng(seed)
-    return INTRA_ORBIT[name](setting.roadmaps, setting.world, setting.insert, rng, WEIGHTS)
+    return INTRA_ORBIT[name](setting.roadmaps, setting.world, setting.insert, rng, WEIGHTS, Deadline())
 
 
 def crossing(robots: int) -> tuple[Setting, At, At]:

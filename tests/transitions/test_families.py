@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
@@ -182,6 +184,23 @@ def test_a_placed_object_stands_on_its_face_inside_the_region(face: str) -> None
     np.testing.assert_allclose(X_SO[:, :3, :3] @ face_normal(face), np.tile([0, 0, -1.0], (200, 1)), atol=1e-12)
     assert np.all(np.abs(X_SO[:, :2, 3]) <= [0.15, 0.1])
     assert X_SO[:, 0, 3].min() < -0.12 and X_SO[:, 1, 3].max() > 0.08
+
+
+def test_placements_keep_the_margin_of_their_region() -> None:
+    support = region(size=(0.3, 0.01), margin=0.02)
+    (family,) = places_of(support)
+    X_SO = inverse(support.X_BS.GetAsMatrix4()) @ family.pose(draw(family, 200))
+    assert np.all(np.abs(X_SO[:, 0, 3]) <= 0.13) and X_SO[:, 0, 3].max() > 0.12
+    np.testing.assert_allclose(X_SO[:, 1, 3], 0.0, atol=1e-12)  # no room for the margin: the middle
+    assert len(family.lower) == 2
+
+
+def test_grasps_may_be_for_some_robots_only() -> None:
+    for_left = replace(EXPLICIT, robots=("left",))
+    item = thing(BOX, for_left, antipodal("-z"))
+    everything = len(grasp_families(item, 0.08))
+    assert len(grasp_families(item, 0.08, "left")) == everything
+    assert len(grasp_families(item, 0.08, "right")) == everything - 1
 
 
 def test_supports_say_who_may_stand_there() -> None:

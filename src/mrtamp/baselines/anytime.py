@@ -11,10 +11,12 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 import numpy as np
 
 from mrtamp.collision import RESOLUTION, Collision, Counts
+from mrtamp.deadline import Deadline, TimeIsUp
 from mrtamp.explain import explain
 from mrtamp.graphs import Graphs
 from mrtamp.guidance import ModalGuidance
@@ -47,7 +49,7 @@ class Anytime(ABC):
         self.seed = seed
         self._clock = time.perf_counter()
         self._spent = 0.0
-        self._end = np.inf
+        self.deadline = Deadline()
         self.rng = np.random.default_rng(seed)
         self._counts = Counts()
         self.collision = Collision(problem, self._counts)
@@ -93,16 +95,18 @@ class Anytime(ABC):
     ) -> Iterator[Plan]:
         """Search, yielding every better plan once it has been checked; see `mrtamp.planner.Planner.improve`."""
         self._clock = time.perf_counter() - self._spent
-        self._end = np.inf if budget_s is None else time.perf_counter() + budget_s
+        self.deadline.set(budget_s)
         stop = np.inf if iterations is None else self.iteration + iterations
         try:
-            while not self._late() and self.iteration < stop:
-                better = self._iterate()
+            while not self._late() and self.iteration < stop and self.cost > 0:
+                before = self.cost
+                with suppress(TimeIsUp):
+                    self._iterate()
                 self.iteration += 1
                 self._spent = self._elapsed()
                 if progress is not None:
                     progress(self.status())
-                if better:
+                if self.cost < before:
                     assert self.best is not None
                     yield self.best
                     if first:
@@ -111,12 +115,12 @@ class Anytime(ABC):
             self._spent = self._elapsed()
 
     @abstractmethod
-    def _iterate(self) -> bool:
-        """One iteration; whether there is a better plan."""
+    def _iterate(self) -> None:
+        """One iteration; it raises `TimeIsUp` or returns soon when the deadline has passed."""
 
     def _late(self) -> bool:
         """Whether the time of this call is over; never where a call is bounded by iterations."""
-        return time.perf_counter() >= self._end
+        return self.deadline.passed
 
     def _elapsed(self) -> float:
         return time.perf_counter() - self._clock

@@ -95,11 +95,11 @@ class ComposedPRM(Anytime):
         """Composite vertices."""
         return len(self.roadmap.at)
 
-    def _iterate(self) -> bool:
+    def _iterate(self) -> None:
         self._sample_interior()
         for _ in range(self.options.transitions):
             if self._late():
-                return False
+                return
             self._sample_crossing()
         self.graph.refresh()
         if self.best is not None and len(self.graph.crossings) > _GROWN * self._pruned:
@@ -107,23 +107,24 @@ class ComposedPRM(Anytime):
             self._pruned = len(self.graph.crossings)
             self._along = [layer for layer in self._along if layer.mode.key in self.graph.layers]
         # One search builds on shortened plans; the other finds plans that shortening may make more of.
-        better = self._search(anew=True)
-        return self._search(anew=False) or better if self.graph.adopted else better
+        self._search(anew=True)
+        if self.graph.adopted:
+            self._search(anew=False)
 
-    def _search(self, *, anew: bool) -> bool:
-        """Search until a path is found that is valid, or none is cheaper; whether there is a better plan."""
+    def _search(self, *, anew: bool) -> None:
+        """Search until a path is found that is valid, or none is cheaper."""
         while not self._late():
             worth = _WORTH if self._uses("refinement") else _EPS
             below = (1 - worth) * (self._searched if anew else self.cost)
             found = self.graph.cheapest(below, self._late, anew=anew)
             if found is None:
-                return False
+                return
             plan = self._judged(found)
             if plan is not None:
                 if anew:
                     self._searched = found.cost
-                return self._keep(found, plan)
-        return False
+                self._keep(found, plan)
+                return
 
     # -- interior -------------------------------------------------------------------------------------------------
 
@@ -196,7 +197,7 @@ class ComposedPRM(Anytime):
         biased = self._uses("goal-bias") and self.rng.random() < _BIAS
         layer = self._draw_layer(biased)
         layer.visits += 1
-        self.graphs.modal.nodes[layer.mode.state]["visits"] += 1
+        self.guidance.visit(layer.mode)
         choice = self._draw_choice(layer, biased)
         if choice is None:
             return
@@ -368,18 +369,16 @@ class ComposedPRM(Anytime):
                 self.graph.ban(found.crossings[violation.segment + 1])
         return None
 
-    def _keep(self, found: Found, plan: Plan) -> bool:
+    def _keep(self, found: Found, plan: Plan) -> None:
         """Offer a plan, and what shortcuts make of it: that goes back into the graph."""
-        better = self._offer(plan)
-        if better:
+        if self._offer(plan):
             self._along = list(dict.fromkeys(c.after for c in found.crossings if c.after is not None))
         shortened = self._shortened(plan, self.options.shortcuts) if self._uses("refinement") else None
         if shortened is None or not self._offer(shortened):
-            return better
+            return
         self._along = [self.graph.layer(s.mode) for s in shortened.segments]
         paths = [self._vertices(s) for s in shortened.segments]
         self.graph.adopt([s.mode for s in shortened.segments], paths, shortened.transitions)
-        return True
 
     def _vertices(self, segment: Segment) -> list[int]:
         """The composite vertices of a segment's waypoints, made where there are none."""

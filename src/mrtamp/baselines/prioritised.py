@@ -82,8 +82,8 @@ class Prioritised(Anytime):
         super().__init__(problem, seed, factored_cache="factored-cache" not in self.options.without)
         for name in self.names:
             self._add_interior(name, self.options.vertices)
-        self.tasks = SkeletonGuidance(problem, self.sampler, self.guidance, self.root)
-        self.steering = Steering(list(self.roadmaps.values()), self.validity, _no_tree, self.rng)
+        self.tasks = SkeletonGuidance(problem, self.sampler, self.guidance, self.root, self.deadline)
+        self.steering = Steering(list(self.roadmaps.values()), self.validity, _no_tree, self.rng, self.deadline)
         self.steering.trouble = self.trouble
         # Cost of the cheapest plan before shortening; whether robots go aside after their courses in this attempt.
         self._cheapest = np.inf
@@ -101,30 +101,30 @@ class Prioritised(Anytime):
         """Vertices of all roadmaps."""
         return sum(g.n_vertices for g in self.roadmaps.values())
 
-    def _iterate(self) -> bool:
+    def _iterate(self) -> None:
         for name in self.names:
             self._add_interior(name, self.options.interior)
         self._rows.forget_if_full()
         self.tasks.grow(self.options.seeds, self.options.keep)
         jobs = self._hand_out(self.options.variety if self.iteration else 0.0)
         if jobs is None:
-            return False
+            return
         rank = {name: k for k, name in enumerate(self.names)}
         if self.iteration:
             rank = {name: int(k) for name, k in zip(self.names, self.rng.permutation(len(rank)), strict=True)}
         self._courteous = self.iteration == 0 or bool(self.rng.random() < 0.5)
         timeline = self._attempt(jobs, rank)
         if timeline is None or not goal_mode(self.problem, timeline.mode, self.validity.X_WB):
-            return False
+            return
         plan = self.incumbent.accepted(*timeline.plan())
         if plan is None:
-            return False
-        better = self._offer(plan)
+            return
+        self._offer(plan)
         if "refinement" not in self.options.without and plan.cost < _ALIKE * self._cheapest:
             self._cheapest = min(self._cheapest, plan.cost)
             shortened = self._shortened(plan, self.options.shortcuts)
-            better |= shortened is not None and self._offer(shortened)
-        return better
+            if shortened is not None:
+                self._offer(shortened)
 
     def explain(self) -> str:
         """Why there is no plan yet: tasks that nobody was found to do, and what the modal estimates say."""

@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from mrtamp.deadline import Deadline
 from mrtamp.intra_orbit.prioritised import Prioritised
 from mrtamp.intra_orbit.tensor_search import TensorSearch
 from mrtamp.problem import CostWeights
@@ -35,6 +36,10 @@ class IntraOrbitPlanner(Protocol):
 
         The other robots may move aside, and others again for them, up to `depth` levels deep; 0: nobody moves aside.
         None if no such node was found.
+
+        Raises
+        ------
+        TimeIsUp : the deadline has passed; what the tree was extended by until then is valid.
         """
         ...
 
@@ -43,7 +48,7 @@ class IntraOrbitPlanner(Protocol):
         ...
 
 
-Factory = Callable[[Sequence[Roadmap], Validity, Insert, np.random.Generator, CostWeights], IntraOrbitPlanner]
+Factory = Callable[[Sequence[Roadmap], Validity, Insert, np.random.Generator, CostWeights, Deadline], IntraOrbitPlanner]
 
 INTRA_ORBIT: dict[str, Factory] = {"tensor-tree": TensorSearch, "prioritised": Prioritised}
 """The implementations by name."""

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mrtamp.deadline import Deadline
 from mrtamp.intra_orbit.lazy_validate import at_once, pair_is_apart
 from mrtamp.modes import Mode
 from mrtamp.problem import CostWeights
@@ -62,11 +63,12 @@ class Prioritised:
         insert: Insert,
         rng: np.random.Generator,
         weights: CostWeights,
+        deadline: Deadline | None = None,
     ) -> None:
         self.roadmaps = list(roadmaps)
         self.validity = validity
         self.insert = insert
-        self.random = Steering(roadmaps, validity, insert, rng)
+        self.random = Steering(roadmaps, validity, insert, rng, deadline)
         self.trouble: Counter[tuple[str, str]] = self.random.trouble
         self.index = self.random.index
         self.weights = weights
@@ -147,6 +149,7 @@ class Prioritised:
             for a, b in itertools.pairwise(schedule)
         ]
         for _ in range(_ROUNDS):
+            self.random.deadline.check()
             way = self._search(longest, task)
             if way is None:
                 return None

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mrtamp.deadline import Deadline
 from mrtamp.intra_orbit.lazy_validate import at_once, pair_is_apart
 from mrtamp.modes import Mode
 from mrtamp.problem import CostWeights
@@ -56,13 +57,14 @@ class TensorSearch:
         insert: Insert,
         rng: np.random.Generator,
         weights: CostWeights,
+        deadline: Deadline | None = None,
     ) -> None:
         self.roadmaps = list(roadmaps)
         self.validity = validity
         self.insert = insert
         self.rng = rng
         self.weights = weights
-        self.one_by_one = Steering(roadmaps, validity, insert, rng)
+        self.one_by_one = Steering(roadmaps, validity, insert, rng, deadline)
         self.index = self.one_by_one.index
         self.trouble = self.one_by_one.trouble
 
@@ -92,6 +94,7 @@ class TensorSearch:
         reached = {node.at}
         self._expand(search, node)
         for _ in range(_STEPS * len(search.goal)):
+            self.one_by_one.deadline.check()
             if not search.heap:
                 return None
             _, _, at, parent = heapq.heappop(search.heap)
@@ -162,7 +165,8 @@ class TensorSearch:
 
     def _free(self, mode: Mode, roadmap: Roadmap, a: int, b: int) -> bool:
         free = self.validity.edge(roadmap.name, roadmap.edge(a, b), mode)
-        self.trouble[roadmap.name, "world"] += not free
+        if not free:
+            self.trouble[roadmap.name, "world"] += 1
         return free
 
     def _met(self, parent: Node, at: At) -> tuple[int, ...]:

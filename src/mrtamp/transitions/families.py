@@ -192,10 +192,12 @@ class TurningGrasp:
 GraspFamily = FixedFamily | SlidingGrasp | TurningGrasp
 
 
-def grasp_families(item: MovableObject, max_width: float) -> list[GraspFamily]:
-    """All grasp families of an object that fit an opening of `max_width` (m)."""
+def grasp_families(item: MovableObject, max_width: float, robot: str | None = None) -> list[GraspFamily]:
+    """All grasp families of an object that fit an opening of `max_width` (m) and are not for other robots only."""
     out: list[GraspFamily] = []
     for number, grasp in enumerate(item.grasps):
+        if robot is not None and grasp.robots is not None and robot not in grasp.robots:
+            continue
         if isinstance(grasp, ExplicitGrasp):
             if grasp.width <= max_width:
                 out.append(FixedFamily(f"grasp {number}", grasp.X_OG.GetAsMatrix4(), grasp.width))
@@ -249,19 +251,22 @@ def _antipodal(shape: Shape, grasp: AntipodalGrasps, approach: str, max_width: f
 
 @dataclass(frozen=True, eq=False)
 class RegionPlacement:
-    """Resting on a face inside a support: X_BO = X_BS * translate(x, y, h) * turn(yaw) * R_face."""
+    """Resting on a face inside a support: X_BO = X_BS * translate(x, y, h) * turn(yaw) * R_face.
+
+    `reach` bounds |x| and |y| (m).
+    """
 
     name: str
     X_BS: np.ndarray
     R_face: np.ndarray
     height: float
-    size: tuple[float, float]
+    reach: tuple[float, float]
     yaw: tuple[float, float]
 
     @property
     def _bounds(self) -> np.ndarray:
-        half = np.asarray(self.size) / 2
-        return np.array([[-half[0], half[0]], [-half[1], half[1]], self.yaw])
+        x, y = self.reach
+        return np.array([[-x, x], [-y, y], self.yaw])
 
     @property
     def _free(self) -> np.ndarray:
@@ -316,7 +321,7 @@ def placement_families(item: MovableObject, support: Support, package_paths: tup
             support.X_BS.GetAsMatrix4(),
             face_rotation(face).matrix(),
             rest_height(item, face, package_paths),
-            support.size,
+            support.reach,
             support.yaw,
         )
         for face in item.resting_faces

@@ -8,6 +8,7 @@ import numpy as np
 
 from mrtamp.kinematics import inverse, matrix
 from mrtamp.modes import Attachment, Mode
+from mrtamp.transitions.estimates import Estimates
 from mrtamp.transitions.projection import uniform_configurations
 from mrtamp.transitions.workspace import Workspace
 
@@ -19,14 +20,20 @@ _ROOM = 0.3
 """Distance (m) between two palms beyond which more does not help."""
 _PALM = 0.08
 """How far (m) behind the grasp point the bulk of a hand lies, for guessing whether two hands have room."""
+_TEMPER = 0.5
+"""Difference of estimated costs to the goal by which one way on is e times less likely than another."""
+_TIE = 0.25
+"""Difference of estimated costs within which ways on are as good."""
 _UP = np.array([0.0, 0.0, 1.0])
 
 
 class Meetings:
     """Proposes giver configurations and receiver grasps; knows grasps that lead on to the goal."""
 
-    def __init__(self, workspace: Workspace) -> None:
+    def __init__(self, workspace: Workspace, estimates: Estimates) -> None:
         self.workspace = workspace
+        self.estimates = estimates
+        self.holds = workspace.holds
         self.rng = workspace.rng
         self.roadmaps = workspace.roadmaps
         self.reach = workspace.reach
@@ -46,12 +53,14 @@ class Meetings:
         reward = self.workspace.look_ahead(mode, robot, item, grasps, np.tile(world.home, (n, 1)))
         pool += [g for g, r in zip(grasps, reward, strict=True) if np.isfinite(r)]
 
-    def propose(self, giver: str, receiver: str, grasp: Attachment, n: int) -> tuple[np.ndarray, list[Attachment]]:
+    def propose(
+        self, giver: str, receiver: str, grasp: Attachment, n: int, *, directly: bool
+    ) -> tuple[np.ndarray, list[Attachment]]:
         """Configurations of the giver, and a grasp for the receiver at each, where the two may meet.
 
         A quarter is uniform in the giver's joints and over the receiver's whole grasp family: positive density over
         the whole stratum.  The rest puts the object between the robots, each hand on its own robot's side, turned
-        freely about the line between the hands.
+        freely about the line between the hands.  `directly` is as for `TransitionSampler.sample_handover`.
         """
         world = self.roadmaps[giver].world
         tool = world.tool
@@ -64,7 +73,7 @@ class Meetings:
             self.workspace.draw_grasp(receiver, grasp.object, int(f))
             for f in self.rng.integers(len(families), size=len(uniform))
         ]
-        aimed = self._receiving_grasps(receiver, grasp, n)
+        aimed = self._receiving_grasps(receiver, grasp, n, directly=directly)
         gap = float(np.linalg.norm(centre - own))
         where = (own + centre) / 2 + self.rng.normal(scale=0.08 + 0.08 * gap, size=(n, 3))
         X_OG1 = inverse(grasp.X_PO)
@@ -91,24 +100,45 @@ class Meetings:
         clear = ~world.hits(world.rows(qa, grasp, {}))
         return qa[clear], [g for g, ok in zip(grasps, clear, strict=True) if ok]
 
-    def _receiving_grasps(self, receiver: str, given: Attachment, n: int) -> list[Attachment]:
-        """n grasps that keep the hands apart, each the best of a few drawn, mostly of those that lead on."""
+    def _receiving_grasps(self, receiver: str, given: Attachment, n: int, *, directly: bool) -> list[Attachment]:
+        """n grasps that keep the hands apart, each the best of a few drawn, mostly of those that lead on.
+
+        That is: of those that can put the object down at its goal, or from faces that the object can be handed on from,
+        by the estimated cost of either.
+        """
         item = given.object
-        families = self.families[receiver, item]
         pool = self.pools.get((receiver, item), [])
+        families = self.holds.families[receiver, item]
+        put, elsewhere = self.estimates.from_faces(given, receiver)
+        if directly and pool:
+            elsewhere = np.full_like(elsewhere, np.inf)
+        costs = np.append(elsewhere, min((put[self.holds.face(g)] for g in pool), default=np.inf))
+        likely = _likely(costs) if np.isfinite(costs).any() else None
         other = _palms(inverse(given.X_PO))
         out = []
         for _ in range(n):
-            if pool and self.rng.random() < 0.8:
+            guided = likely is not None and self.rng.random() < 0.8
+            way = int(self.rng.choice(len(costs), p=likely)) if guided else None
+            if way == len(elsewhere):
                 drawn = [pool[int(k)] for k in self.rng.integers(len(pool), size=_GRASP_DRAWS)]
             else:
+                numbers = families[way] if way is not None else range(len(self.families[receiver, item]))
                 drawn = [
-                    self.workspace.draw_grasp(receiver, item, int(f))
-                    for f in self.rng.integers(len(families), size=_GRASP_DRAWS)
+                    self.workspace.draw_grasp(receiver, item, numbers[int(k)])
+                    for k in self.rng.integers(len(numbers), size=_GRASP_DRAWS)
                 ]
             apart = np.linalg.norm(_palms(inverse(np.array([g.X_PO for g in drawn]))) - other, axis=1)
             out.append(drawn[int(np.argmax(np.minimum(apart, _ROOM)))])
         return out
+
+    def leads_on(self, given: Attachment, taken: Sequence[Attachment], directly: np.ndarray) -> np.ndarray:
+        """Which handovers (N,) are on a cheapest way to the goal; `directly` (N,): the place at the goal was seen."""
+        if not len(taken):
+            return np.zeros(0, dtype=bool)
+        put, elsewhere = self.estimates.from_faces(given, taken[0].parent)
+        faces = [self.holds.face(g) for g in taken]
+        best = min(put.min(), elsewhere.min())
+        return np.minimum(np.where(directly, put[faces], np.inf), elsewhere[faces]) <= best + _TIE
 
     def room(self, item: str, robot: str, grasps: Sequence[Attachment]) -> np.ndarray:
         """Distance (m) of each grasp's palm to the farthest palm of another robot that leads on; at most _ROOM."""
@@ -155,3 +185,9 @@ def _rotations_about(z: np.ndarray, angles: np.ndarray) -> np.ndarray:
     R = _rotations_to(z[None])[0]
     c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
     return np.stack([c * R[:, 0] + s * R[:, 1], c * R[:, 1] - s * R[:, 0], np.tile(z, (len(angles), 1))], axis=2)
+
+
+def _likely(costs: np.ndarray) -> np.ndarray:
+    """Probabilities (N,) of ways on by their costs, one of which is finite."""
+    p = np.exp((costs.min() - costs) / _TEMPER)
+    return p / p.sum()

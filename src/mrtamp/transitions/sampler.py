@@ -18,6 +18,7 @@ from mrtamp.problem import Problem
 from mrtamp.roadmap import Roadmap
 from mrtamp.transitions.candidate import Candidate, Outcome
 from mrtamp.transitions.contacts import ContactBuilder
+from mrtamp.transitions.estimates import Estimates
 from mrtamp.transitions.families import FixedFamily, placement_families
 from mrtamp.transitions.meetings import Meetings
 from mrtamp.transitions.reach import ReachSampler
@@ -31,6 +32,10 @@ _ROUNDS = 3
 _ENOUGH = 8
 """Grasps that fit around the object which are enough to choose from; fewer call for another round of samples."""
 _OUTSIDE = 0.02
+_DRAWN, _PLACED = 0.1, 4.0
+"""Weights as attempts in vain: of a sample of a pick, and of all samples of a place in one call."""
+_NOT_MET, _EXCHANGED = 0.05, 0.5
+"""The same of handovers: of one that IK did not solve, and of one that collided."""
 _ROOMY = 0.85
 """Share of the largest room seen for a second hand that a promising grasp leaves."""
 _NO_WAY_ON = 50.0
@@ -50,7 +55,8 @@ class TransitionSampler(Workspace):
     ) -> None:
         super().__init__(problem, collision, roadmaps, validity, rng)
         self.contacts = ContactBuilder(self)
-        self.meetings = Meetings(self)
+        self.estimates = Estimates(self)
+        self.meetings = Meetings(self, self.estimates)
         self.reaching = ReachSampler(self)
         self._picks: dict[tuple[str, tuple[Attachment, ...]], list[Candidate]] = {}
         self._places: dict[tuple[str, Attachment], list[Candidate]] = {}
@@ -108,7 +114,7 @@ class TransitionSampler(Workspace):
         if not strata:
             stats.collisions["gripper too small"] += 1
             return []
-        before = dict(stats.collisions)
+        before, tries = dict(stats.collisions), stats.tries.copy()
         parts, grasps, families = [], [], []
         for _ in range(_ROUNDS):
             drawn = self.draw(robot, strata, n, stats)
@@ -123,6 +129,9 @@ class TransitionSampler(Workspace):
                 grasps.append(self.grasp(robot, item, self.families[robot, item][f], f, c[k]))
             if len(grasps) >= _ENOUGH:
                 break
+        tried = {k: stats.tries[s.family.name] - tries[s.family.name] for k, s in enumerate(strata)}
+        self.holds.note_families(robot, item, placement.place, tried, _DRAWN)
+        self.holds.note_picks(robot, item, placement.place, grasps)
         if not grasps:
             self._note_blockers(mode, stats, before, False)
             return []
@@ -164,8 +173,11 @@ class TransitionSampler(Workspace):
         if not strata or (on_object and mode.of[body].held):
             return []
         before = dict(stats.collisions)
+        at_goal = any(s.name == support for s in self.goal_supports[item])
         drawn = self.draw(robot, strata, n, stats)
         if drawn is None:
+            if at_goal:
+                self.holds.note_place(grasp, False, _PLACED)
             return []
         q, family, c = drawn
         base = mode.chain(body) if on_object else ()
@@ -183,10 +195,18 @@ class TransitionSampler(Workspace):
                 if len(out) == keep:
                     break
         self._note_blockers(mode, stats, before, bool(out))
+        if at_goal:
+            self.holds.note_place(grasp, bool(out), _PLACED)
         return out
 
-    def sample_handover(self, mode: Mode, giver: str, receiver: str, n: int = 72, keep: int = 3) -> list[Candidate]:
-        """Sample handovers of what `giver` holds to `receiver`; returns the new candidates."""
+    def sample_handover(
+        self, mode: Mode, giver: str, receiver: str, n: int = 72, keep: int = 3, *, directly: bool = False
+    ) -> list[Candidate]:
+        """Sample handovers of what `giver` holds to `receiver`; returns the new candidates.
+
+        `directly`: mostly those from which the receiver can put the object down at its goal, however hard they are to
+        find; else those from which it has to be handed on as well, where that seems the shorter way by now.
+        """
         grasp = mode.held[giver]
         item = grasp.object
         stats = self.outcome(("handover", (giver, receiver), item, giver))
@@ -194,7 +214,7 @@ class TransitionSampler(Workspace):
         if not self.strata(mode, "handover", (giver, receiver), item):
             return []
         self.meetings.grow_pool(mode, receiver, item)
-        qa, grasps = self.meetings.propose(giver, receiver, grasp, n)
+        qa, grasps = self.meetings.propose(giver, receiver, grasp, n, directly=directly)
         if not len(qa):
             return []
         X_WG = self._received(giver, grasp, qa, grasps)
@@ -203,7 +223,7 @@ class TransitionSampler(Workspace):
         found, each = (x.reshape(len(qa), _SEEDS, -1) for x in self.ik(receiver, X_WG, self.seeds(receiver, X_WG, 0.6)))
         solved = np.asarray(each[:, :, 0].any(axis=1))
         qb = found[np.arange(len(qa)), np.argmax(each[:, :, 0], axis=1)]
-        return self._exchanges(mode, giver, receiver, grasps, qa, qb, solved, keep)
+        return self._exchanges(mode, giver, receiver, grasps, qa, qb, solved, keep, directly=directly)
 
     def vary_handover(
         self, mode: Mode, giver: str, receiver: str, taken: Attachment, qa: np.ndarray, qb: np.ndarray, keep: int = 3
@@ -213,7 +233,7 @@ class TransitionSampler(Workspace):
         stats.calls += 1
         grasps = [taken] * len(qa)
         q, solved = self.ik(receiver, self._received(giver, mode.held[giver], qa, grasps), qb)
-        return self._exchanges(mode, giver, receiver, grasps, qa, q, solved, keep)
+        return self._exchanges(mode, giver, receiver, grasps, qa, q, solved, keep, directly=True)
 
     def _received(self, giver: str, grasp: Attachment, qa: np.ndarray, grasps: Sequence[Attachment]) -> np.ndarray:
         """Poses X_WG (N, 4, 4) of the receiver's hand for each of its grasps, with the giver at qa (N, n)."""
@@ -230,6 +250,8 @@ class TransitionSampler(Workspace):
         qb: np.ndarray,
         solved: np.ndarray,
         keep: int,
+        *,
+        directly: bool,
     ) -> list[Candidate]:
         """Candidates of those solved handovers that are free of collision, up to `keep`."""
         grasp = mode.held[giver]
@@ -242,15 +264,18 @@ class TransitionSampler(Workspace):
         reward = self.look_ahead(mode, receiver, item, into, qb[rows])
         homes = [self.roadmaps[r].world.home for r in (giver, receiver)]
         near = np.linalg.norm(qa[rows] - homes[0], axis=1) + np.linalg.norm(qb[rows] - homes[1], axis=1)
+        for i in np.flatnonzero(~solved).tolist():
+            self.holds.note_exchange(grasp, grasps[i], False, _NOT_MET)
         out: list[Candidate] = []
         promising = np.isfinite(reward)
-        if not self.meetings.pools.get((receiver, item)):
-            promising[:] = True
-        order = self.mixed_order(near + np.where(np.isfinite(reward), reward, _NO_WAY_ON))
-        # Of those that cannot be put down where they belong afterwards, a few are enough.
-        order = np.concatenate([order[promising[order]][: 4 * keep], order[~promising[order]][:2]])
+        order = self.mixed_order(near + np.where(promising, reward, _NO_WAY_ON))
+        # Of those that are not on the shortest way to the goal, as far as that is known, a few are enough.
+        pool = self.meetings.pools.get((receiver, item))
+        leads = promising if directly and pool else self.meetings.leads_on(grasp, into, promising)
+        order = np.concatenate([order[leads[order]][: 4 * keep], order[~leads[order]][:2]])
         for k in order.tolist():
             at = self.contacts.exchange(mode, giver, receiver, grasp, into[k], qa[rows[k]], qb[rows[k]], stats)
+            self.holds.note_exchange(grasp, into[k], at is not None, _EXCHANGED)
             if at is not None:
                 candidate = Candidate("handover", (giver, receiver), at, grasp, into[k], promising=bool(promising[k]))
                 self._handovers.setdefault((grasp, receiver), []).append(candidate)

@@ -209,7 +209,8 @@ class Ways:
         out: list[Way] = []
         for pick in [picks[int(i)] for i in self.rng.permutation(len(picks))[:2]]:
             held = mode.replace(*([pick.after] if pick.after else []))
-            out += self._followed_up(mode, pick, sampler.sample_handover(held, giver, receiver, n), places)
+            handovers = sampler.sample_handover(held, giver, receiver, n, directly=True)
+            out += self._followed_up(mode, pick, handovers, places)
             if len(out) >= keep:
                 break
         if self.tries[key] > 1:

@@ -13,9 +13,13 @@ from mrtamp.problem import AtPose, InRegion, Problem, Support
 from mrtamp.roadmap import Roadmap
 from mrtamp.transitions.candidate import Outcome, StratumKey
 from mrtamp.transitions.families import FixedFamily, GraspFamily, grasp_families, placement_families
+from mrtamp.transitions.holds import Holds
 from mrtamp.transitions.projection import mixed_seeds, solve_ik
 from mrtamp.transitions.reachability import ReachabilityMap
 from mrtamp.validity import Validity
+
+_UNSOLVED = 0.3
+"""Weight of a look ahead for which IK found nothing, as an attempt in vain: other seeds may do better."""
 
 
 class Workspace:
@@ -29,6 +33,7 @@ class Workspace:
     goal_supports : object -> supports on which it satisfies its goal.
     outcomes : what became of all samples, per stratum.
     foreseen : what looking ahead at strata showed, without what may stand in the way there.
+    holds : the same for robots and faces of objects.
     """
 
     def __init__(
@@ -53,11 +58,12 @@ class Workspace:
         for robot in problem.robots:
             gripper = robot.model.gripper
             for item in problem.objects:
-                fits = grasp_families(item, gripper.max_width) if gripper else []
+                fits = grasp_families(item, gripper.max_width, robot.name) if gripper else []
                 self.families[robot.name, item.name] = fits
             reachable = ReachabilityMap(roadmaps[robot.name].world.tool)
             self.maps[robot.name] = reachable
             self.reach[robot.name] = (reachable.centre, reachable.radius)
+        self.holds = Holds([r.name for r in problem.robots], self.families)
         self.goal_supports: dict[str, list[Support]] = {
             o.name: _goal_supports(problem, o.name) for o in problem.objects
         }
@@ -150,7 +156,10 @@ class Workspace:
         start = self.rng.random(len(q))[:, None]
         seeds = np.where(start < 0.5, q, np.where(start < 0.85, world.home, self.maps[robot].seeds(X_WG, self.rng)))
         found, solved = self.ik(robot, X_WG, seeds + self.rng.normal(scale=0.3, size=q.shape))
-        for i in np.flatnonzero(solved).tolist():
+        for i, ok in enumerate(solved.tolist()):
+            if not ok:
+                self.holds.note_place(grasps[i], False, _UNSOLVED)
+                continue
             support, below, _ = places[which[i]]
             stats = self.foresight(("place", (robot,), item, support.name))
             stats.ik_solved += 1
@@ -158,6 +167,7 @@ class Workspace:
             if world.first_hit(rows, support.body, world.slot_of[item]) < 0:
                 reward[i] = np.linalg.norm(found[i] - q[i])
                 stats.accepted += 1
+            self.holds.note_place(grasps[i], bool(np.isfinite(reward[i])))
         return reward
 
 
