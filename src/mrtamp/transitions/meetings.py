@@ -110,7 +110,7 @@ class Meetings:
         pool = self.pools.get((receiver, item), [])
         families = self.holds.families[receiver, item]
         put, elsewhere = self.estimates.from_faces(given, receiver)
-        if directly and pool:
+        if directly:
             elsewhere = np.full_like(elsewhere, np.inf)
         costs = np.append(elsewhere, min((put[self.holds.face(g)] for g in pool), default=np.inf))
         likely = _likely(costs) if np.isfinite(costs).any() else None
@@ -131,14 +131,21 @@ class Meetings:
             out.append(drawn[int(np.argmax(np.minimum(apart, _ROOM)))])
         return out
 
-    def leads_on(self, given: Attachment, taken: Sequence[Attachment], directly: np.ndarray) -> np.ndarray:
-        """Which handovers (N,) are on a cheapest way to the goal; `directly` (N,): the place at the goal was seen."""
+    def leads_on(
+        self, given: Attachment, taken: Sequence[Attachment], seen: np.ndarray, *, directly: bool
+    ) -> np.ndarray:
+        """Which handovers (N,) are on a cheapest way to the goal; `seen` (N,): the place at the goal was.
+
+        `directly`: which are followed by that place, if any such are known at all.
+        """
         if not len(taken):
             return np.zeros(0, dtype=bool)
+        if directly:
+            return seen if self.pools.get((taken[0].parent, given.object)) else np.ones(len(taken), dtype=bool)
         put, elsewhere = self.estimates.from_faces(given, taken[0].parent)
         faces = [self.holds.face(g) for g in taken]
         best = min(put.min(), elsewhere.min())
-        return np.minimum(np.where(directly, put[faces], np.inf), elsewhere[faces]) <= best + _TIE
+        return np.minimum(np.where(seen, put[faces], np.inf), elsewhere[faces]) <= best + _TIE
 
     def room(self, item: str, robot: str, grasps: Sequence[Attachment]) -> np.ndarray:
         """Distance (m) of each grasp's palm to the farthest palm of another robot that leads on; at most _ROOM."""

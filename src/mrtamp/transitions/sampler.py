@@ -270,8 +270,7 @@ class TransitionSampler(Workspace):
         promising = np.isfinite(reward)
         order = self.mixed_order(near + np.where(promising, reward, _NO_WAY_ON))
         # Of those that are not on the shortest way to the goal, as far as that is known, a few are enough.
-        pool = self.meetings.pools.get((receiver, item))
-        leads = promising if directly and pool else self.meetings.leads_on(grasp, into, promising)
+        leads = self.meetings.leads_on(grasp, into, promising, directly=directly)
         order = np.concatenate([order[leads[order]][: 4 * keep], order[~leads[order]][:2]])
         for k in order.tolist():
             at = self.contacts.exchange(mode, giver, receiver, grasp, into[k], qa[rows[k]], qb[rows[k]], stats)
