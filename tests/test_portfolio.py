@@ -63,3 +63,19 @@ def test_a_plan_is_taken_once_and_only_so_many_are_kept(tmp_path: Path) -> None:
     taken = sum(planner.portfolio.add(roundabout(planner, 0.8 - 0.2 * k)) for k in range(SIZE + 2))
     assert taken >= SIZE - 1
     assert len(planner.portfolio._entries) == SIZE
+
+
+def test_drafts_that_are_free_count_as_plans_and_make_room_for_themselves(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    portfolio = planner.portfolio
+    for k in range(SIZE):
+        assert portfolio.add(roundabout(planner, 0.9 - 0.2 * k))
+    plans = [roundabout(planner, 0.85 - 0.2 * k) for k in range(3)]
+    drafts = [(p.cost, portfolio.yielding.time(p.segments, p.transitions)) for p in plans]
+    assert all(draft.conflict == 0.0 for _, draft in drafts), "both at once, on opposite sides"
+    assert portfolio.add_drafts(drafts) == 3
+    assert portfolio.add_drafts(drafts) == 0, "they are known"
+    assert len(portfolio._entries) == SIZE
+    assert not any(e.draft for e in portfolio._entries)
+    best = portfolio.improve(plans[0].cost)
+    assert best is None or check_plan(best).ok

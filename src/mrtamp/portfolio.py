@@ -92,7 +92,7 @@ class _Entry:
 
 
 class Portfolio:
-    """Up to SIZE plans that take turns: the newest get a trial, then the cheapest goes on until it has converged."""
+    """Up to SIZE plans and drafts in turns: the newest get a trial, then the cheapest goes on until it converges."""
 
     def __init__(
         self,
@@ -125,18 +125,12 @@ class Portfolio:
         self.yielding = Yielding(problem, self._nearness)
 
     def add(self, plan: Plan) -> bool:
-        """Put a checked plan under refinement; False if one like it is or was.
-
-        When there are too many the dearest goes, those that are finished first.
-        """
+        """Put a checked plan under refinement; False if one like it is or was."""
         alike = [e for e in self._entries if _order(e.plan.transitions) == _order(plan.transitions)]
         if round(plan.cost, 6) in self._seen or any(abs(e.cost - plan.cost) < _ALIKE * plan.cost for e in alike):
             return False
         self._seen.add(round(plan.cost, 6))
-        self._entries.append(_Entry(plan))
-        if len(self._entries) > SIZE:
-            finished = [e for e in self._entries[:-1] if e.done] or self._entries[:-1]
-            self._entries.remove(max(finished, key=lambda e: e.cost))
+        self._admit([_Entry(plan)])
         return True
 
     def knows(self, transitions: Sequence[Transition]) -> bool:
@@ -159,8 +153,16 @@ class Portfolio:
             entry = _Entry(free or plan, draft=free is None, estimate=estimate)
             entry.optimiser = self._optimiser(entry)
             fresh.append(entry)
-        self._entries += fresh[::-1]
+        self._admit(fresh[::-1])
         return len(fresh)
+
+    def _admit(self, fresh: list[_Entry]) -> None:
+        """Take entries in; when there are too many the dearest of the others go, finished ones first, drafts last."""
+        self._entries += fresh
+        while len(self._entries) > SIZE:
+            others = [e for e in self._entries if e not in fresh]
+            going = [e for e in others if e.done] or [e for e in others if not e.draft] or others
+            self._entries.remove(max(going, key=lambda e: e.cost))
 
     def improve(self, incumbent: float) -> Plan | None:
         """Give one plan its turn; a checked plan when it is clearly cheaper than `incumbent`."""
