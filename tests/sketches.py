@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from mrtamp.kinematics import inverse
-from mrtamp.modes import Attachment, object_poses, start_mode
+from mrtamp.modes import Attachment, object_poses, start_mode, static_poses
 from mrtamp.plan import Action, Plan, Segment, Transition, plan_cost
-from mrtamp.playback import static_poses
 from mrtamp.problem import Problem
 from mrtamp.scene import build_scene, chain_of
 

@@ -34,7 +34,7 @@ def plan(planner: Planner) -> Plan:
 def refined(planner: Planner, plan: Plan) -> Refiner:
     """Where something slips between the samples they are halved, as the portfolio does when the judge objects."""
     for halvings in range(3):
-        better = Refiner.of_plan(plan, planner.validity, np.random.default_rng(0), RESOLUTION / 2**halvings)
+        better = Refiner(plan, planner.validity, np.random.default_rng(0), RESOLUTION / 2**halvings)
         costs = [better.cost]
         for _ in range(8):
             gain = better.improve(100)
@@ -51,7 +51,7 @@ def judged(planner: Planner, better: Refiner) -> Plan:
 
 
 def refiner(planner: Planner, plan: Plan, seed: int = 0) -> Refiner:
-    return Refiner.of_plan(plan, planner.validity, np.random.default_rng(seed))
+    return Refiner(plan, planner.validity, np.random.default_rng(seed))
 
 
 def test_a_fresh_refiner_has_the_motion_and_the_cost_of_its_plan(planner: Planner, plan: Plan) -> None:

@@ -8,7 +8,7 @@ aside, keeps robots apart.  Idle and finished robots may always move (DESIGN sec
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -219,9 +219,8 @@ class Insertion:
             v = state.at[other]
             if other in candidate.at or self.validity.edge(other, self.roadmaps[other].edge(v, v), mode):
                 continue
-            for w in self._ways_out(state, other, targets):
-                moved = self._bring(state, other, w, targets, depth - 1, aside=True)
-                done = self._happen(moved, k, stand, targets, depth - 1) if moved is not None else None
+            for moved in self._asides(state, other, targets, depth):
+                done = self._happen(moved, k, stand, targets, depth - 1)
                 if done is not None:
                     return done
         return None
@@ -274,14 +273,21 @@ class Insertion:
         if depth == 0:
             return None
         for other in blockers:
-            for w in self._ways_out(state, other, targets):
-                if not self._clears(state, other, w, leg):
-                    continue
-                moved = self._bring(state, other, w, targets, depth - 1, aside=True)
-                done = self._bring(moved, robot, v, targets, depth - 1) if moved is not None else None
+            for moved in self._asides(state, other, targets, depth, leg):
+                done = self._bring(moved, robot, v, targets, depth - 1)
                 if done is not None:
                     return done
         return None
+
+    def _asides(
+        self, state: _State, robot: str, targets: Mapping[str, int], depth: int, leg: Leg | None = None
+    ) -> Iterator[_State]:
+        """Schedules in which a robot has gone elsewhere, with `leg` to where it leaves that free."""
+        for w in self._ways_out(state, robot, targets):
+            if leg is None or self._clears(state, robot, w, leg):
+                moved = self._bring(state, robot, w, targets, depth - 1, aside=True)
+                if moved is not None:
+                    yield moved
 
     def _ways_out(self, state: _State, robot: str, targets: Mapping[str, int]) -> list[int]:
         """Vertices a robot may go to: its next stop, the start, back from where it stands, anywhere."""

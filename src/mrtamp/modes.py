@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mrtamp.kinematics import inverse
-from mrtamp.problem import AtPose, HeldBy, InRegion, Problem, RobotAt
+from mrtamp.problem import WORLD, AtPose, HeldBy, InRegion, Problem, RobotAt
 
 if TYPE_CHECKING:
     from mrtamp.plan import Transition
@@ -139,6 +139,11 @@ def start_mode(problem: Problem) -> Mode:
             for o in problem.objects
         )
     )
+
+
+def static_poses(problem: Problem) -> dict[str, np.ndarray]:
+    """World poses (4, 4) of the world frame and of every static body."""
+    return {WORLD: np.eye(4), **{s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}}
 
 
 def object_poses(mode: Mode, X_WP: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

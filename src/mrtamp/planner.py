@@ -144,9 +144,7 @@ class Planner:
         self.skeletons = SkeletonGuidance(problem, self.sampler, self.guidance, mode, self.deadline)
         self.portfolio = Portfolio(
             problem,
-            self.collision,
             self.validity,
-            self.roadmaps,
             self.sampler,
             self.incumbent,
             self.rng,

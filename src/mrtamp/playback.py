@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mrtamp.kinematics import quaternions
-from mrtamp.modes import Mode, object_poses, start_mode
+from mrtamp.modes import Mode, object_poses, start_mode, static_poses
 from mrtamp.plan import Plan, Segment, Transition, motion_lengths
-from mrtamp.problem import WORLD, Problem
+from mrtamp.problem import Problem
 from mrtamp.scene import Scene, chain_of
 
 SPEED = 1.0
@@ -108,11 +108,6 @@ class Playback:
                 out[a:b, k : k + 4] = quaternions(X[:, :3, :3])
                 out[a:b, k + 4 : k + 7] = X[:, :3, 3]
         return out
-
-
-def static_poses(problem: Problem) -> Mapping[str, np.ndarray]:
-    """World poses (4, 4) of the world frame and of every static body."""
-    return {WORLD: np.eye(4), **{s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}}
 
 
 def standstill(problem: Problem) -> Plan:

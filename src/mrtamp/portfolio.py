@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from mrtamp.collision import RESOLUTION, Collision
+from mrtamp.collision import RESOLUTION
 from mrtamp.incumbent import Incumbent
 from mrtamp.optimise import Optimiser
 from mrtamp.optimise.nearness import Nearness
@@ -15,7 +15,6 @@ from mrtamp.optimise.yielding import Draft, Yielding
 from mrtamp.plan import Plan, Transition
 from mrtamp.problem import Problem
 from mrtamp.refine import Refiner
-from mrtamp.roadmap import Roadmap
 from mrtamp.transitions.sampler import TransitionSampler
 from mrtamp.validity import Validity
 
@@ -97,9 +96,7 @@ class Portfolio:
     def __init__(
         self,
         problem: Problem,
-        collision: Collision,
         validity: Validity,
-        roadmaps: Mapping[str, Roadmap],
         sampler: TransitionSampler,
         incumbent: Incumbent,
         rng: np.random.Generator,
@@ -108,9 +105,7 @@ class Portfolio:
         sliding: bool = True,
     ) -> None:
         self.problem = problem
-        self.collision = collision
         self.validity = validity
-        self.roadmaps = roadmaps
         self.sampler = sampler
         self.incumbent = incumbent
         self.rng = rng
@@ -121,7 +116,7 @@ class Portfolio:
         self._seen: set[float] = set()
         self._share = 0.0
         """The least that a draft has cost in the end, relative to its estimate."""
-        self._nearness = Nearness(collision)
+        self._nearness = Nearness(validity.collision)
         self.yielding = Yielding(problem, self._nearness)
 
     def add(self, plan: Plan) -> bool:
@@ -220,7 +215,7 @@ class Portfolio:
         plan = self._offer(entry, incumbent, entry.refiner)
         if entry.refiner is None:
             return plan
-        size = len(self.roadmaps) * max(len(entry.plan.transitions), 1)
+        size = len(self.validity.roadmaps) * max(len(entry.plan.transitions), 1)
         enough = entry.proposals >= (_SHORTENING * size if self.convex else _ALONE)
         if enough or (entry.proposals > 2 * _SLICE and gain < _STALE * entry.cost):
             if self.convex:
@@ -299,7 +294,7 @@ class Portfolio:
         return None
 
     def _refiner(self, entry: _Entry) -> Refiner:
-        return Refiner.of_plan(entry.plan, self.validity, self.rng, entry.resolution)
+        return Refiner(entry.plan, self.validity, self.rng, entry.resolution)
 
 
 def _order(transitions: Sequence[Transition]) -> tuple:

@@ -16,12 +16,10 @@ from itertools import pairwise
 import numpy as np
 
 from mrtamp.clearance import Clearance, Track
-from mrtamp.collision import RESOLUTION, Collision
+from mrtamp.collision import RESOLUTION
 from mrtamp.modes import Mode
 from mrtamp.plan import Action, Plan, Segment, Transition
-from mrtamp.problem import CostWeights
 from mrtamp.retiming import Grid, Timing, cut, duration, simple_timing
-from mrtamp.roadmap import Roadmap
 from mrtamp.validity import Resting, Validity
 
 _KNOT = 0.3
@@ -85,19 +83,12 @@ class Refiner:
     """
 
     def __init__(
-        self,
-        segments: Sequence[Segment],
-        transitions: Sequence[Transition],
-        weights: CostWeights,
-        collision: Collision,
-        validity: Validity,
-        roadmaps: Mapping[str, Roadmap],
-        rng: np.random.Generator,
-        resolution: float = RESOLUTION,
+        self, plan: Plan, validity: Validity, rng: np.random.Generator, resolution: float = RESOLUTION
     ) -> None:
-        self.weights = weights
+        segments, collision = plan.segments, validity.collision
+        self.weights = plan.problem.cost
         self.validity = validity
-        self.roadmaps = roadmaps
+        self.roadmaps = validity.roadmaps
         self.rng = rng
         self.clearance = Clearance(collision, resolution, rng)
         self.names = list(segments[0].q)
@@ -109,26 +100,10 @@ class Refiner:
         self._tries = 0
         self._after = {s.name: s.after for s in collision.problem.subgoals}
         self._start = segments[0].mode
-        self._load(segments, transitions)
+        self._load(segments, plan.transitions)
         self._subdivide()
         self._measure()
         self._settle()
-
-    @classmethod
-    def of_plan(
-        cls, plan: Plan, validity: Validity, rng: np.random.Generator, resolution: float = RESOLUTION
-    ) -> Refiner:
-        """A refiner of a plan, priced as its problem says, with the roadmaps and collision queries of `validity`."""
-        return cls(
-            plan.segments,
-            plan.transitions,
-            plan.problem.cost,
-            validity.collision,
-            validity,
-            validity.roadmaps,
-            rng,
-            resolution,
-        )
 
     # -- representation -------------------------------------------------------------------------------------------
 

@@ -21,8 +21,8 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 
-from mrtamp.modes import start_mode
-from mrtamp.playback import Playback, standstill, static_poses
+from mrtamp.modes import start_mode, static_poses
+from mrtamp.playback import Playback, standstill
 from mrtamp.problem import AtConfiguration, AtPose, HandAt, HandIn, InRegion, Problem, Support
 from mrtamp.scene import build_scene, chain_of, robot_joint
 

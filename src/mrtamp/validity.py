@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mrtamp.collision import Collision, bisection_order
-from mrtamp.modes import Attachment, Mode
-from mrtamp.problem import WORLD, Problem
+from mrtamp.modes import Attachment, Mode, static_poses
+from mrtamp.problem import Problem
 from mrtamp.roadmap import Roadmap
 
 _SLACK = 0.012
@@ -60,7 +60,7 @@ class Validity:
         self.collision = collision
         self.roadmaps = roadmaps
         self.counts = collision.counts
-        self.X_WB = {WORLD: np.eye(4), **{s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}}
+        self.X_WB = static_poses(problem)
         self.touching: dict[tuple[str, int], tuple[str, str]] = {}
         """(robot, vertex) of a subgoal that takes or releases an object -> that object and what it rests on there."""
         self._labels: dict[Hashable, Label] = {}

@@ -139,7 +139,7 @@ class Anytime(ABC):
         """A checked plan made from `plan` by shortcuts robot by robot, where that is cheaper."""
         resolution = RESOLUTION
         for _ in range(_FINER):
-            refiner = Refiner.of_plan(plan, self.validity, self.rng, resolution)
+            refiner = Refiner(plan, self.validity, self.rng, resolution)
             done = 0
             while done < proposals and not self._late():
                 refiner.improve(min(_SLICE, proposals - done))

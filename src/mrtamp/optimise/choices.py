@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mrtamp.kinematics import inverse, rotation_vectors
-from mrtamp.modes import Attachment, Mode
+from mrtamp.modes import Attachment, Mode, static_poses
 from mrtamp.optimise.screws import cross, transported
 from mrtamp.plan import Action, Transition
-from mrtamp.problem import WORLD, AtPose, InRegion, Problem
+from mrtamp.problem import AtPose, InRegion, Problem
 from mrtamp.transitions.families import Family, GraspFamily, placement_families, residual
 
 _ON_FAMILY = 1e-5
@@ -73,7 +73,7 @@ class Choices:
         self.modes = list(modes)
         self.transitions = list(transitions)
         self.families = families
-        self.X_WB = {WORLD: np.eye(4), **{s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}}
+        self.X_WB = static_poses(problem)
         fixed = set(modes[0].attachments)
         for t in transitions:
             for action in t.actions:

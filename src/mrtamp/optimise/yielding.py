@@ -14,10 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from mrtamp.modes import Attachment, Mode, object_poses
-from mrtamp.optimise.nearness import Nearness, Samples, State
+from mrtamp.modes import Attachment, Mode, object_poses, static_poses
+from mrtamp.optimise.nearness import Near, Nearness, Samples, State
 from mrtamp.plan import Segment, Transition
-from mrtamp.problem import WORLD, Problem
+from mrtamp.problem import Problem
+from mrtamp.refine import must_follow
 
 _STEP = 0.3
 """Longest step (rad or m) of a robot along its way."""
@@ -98,7 +99,7 @@ class Yielding:
         self.nearness = nearness
         # Poses of what is held are of no interest.
         nowhere = dict.fromkeys(nearness.worlds, np.eye(4))
-        self._X_WP = {WORLD: np.eye(4), **{s.name: s.X_WB.GetAsMatrix4() for s in problem.statics}, **nowhere}
+        self._X_WP = {**static_poses(problem), **nowhere}
         self._radius = {o: r for w in nearness.worlds.values() for o, r in w.object_radius.items()}
 
     def time(self, segments: Sequence[Segment], transitions: Sequence[Transition]) -> Draft:
@@ -157,20 +158,12 @@ class Yielding:
         return out
 
     def _precedence(self, transitions: Sequence[Transition], rests: Sequence[_Rest]) -> dict[int, set[int]]:
-        """Event -> earlier ones that have to stay earlier; what one robot does one after the other is not listed.
-
-        Those with the same object, those with what an object lies on, subgoals that come after others, and leaving a
-        place before something else is put there.
-        """
-        after = {s.name: set(s.after) for s in self.problem.subgoals}
-        about = []
-        for t in transitions:
-            attached = [x for a in t.actions for x in (a.before, a.after) if x is not None]
-            about.append({x.object for x in attached} | {x.parent for x in attached if x.parent in self._radius})
+        """Event -> earlier ones that have to stay earlier: those it must follow, and those that make room for it."""
+        after = {s.name: s.after for s in self.problem.subgoals}
         out: dict[int, set[int]] = {k: set() for k in range(len(transitions))}
         for j, k in itertools.combinations(range(len(transitions)), 2):
-            waits = {s for a in transitions[k].actions if a.subgoal is not None for s in after[a.subgoal]}
-            if about[j] & about[k] or waits & {a.subgoal for a in transitions[j].actions}:
+            pairs = itertools.product(transitions[j].actions, transitions[k].actions)
+            if any(must_follow(a, b, after) for a, b in pairs):
                 out[k].add(j)
         for x, y in itertools.permutations(rests, 2):
             if x.until is not None and y.since is not None and x.until < y.since:
@@ -226,9 +219,7 @@ class Yielding:
         of = a.stage[used[U]] * len(b.held) + b.stage[N]
         samples = Samples(np.arange(len(U)), np.zeros(len(U)), of)
         near = self.nearness.between((one, two), states, samples, situations, 0.0)
-        found = np.zeros(len(U))
-        np.maximum.at(found, near.sample, -near.distance - near.padding)
-        out[U, N] = found
+        out[U, N] = _deepest(near, len(U))
         return out
 
     def _depths_at_rests(
@@ -280,10 +271,15 @@ class Yielding:
         near = self.nearness.world(robot, course.state.of(close), samples, situations, 0.0)
         number = self.nearness.carriers.number["object", item]
         about = (near.a == number) | (near.b == number)
-        found = np.zeros(len(close))
-        np.maximum.at(found, near.sample[about], -(near.distance + near.padding)[about])
-        out[close] = found
+        out[close] = _deepest(near, len(close), about)
         return out
+
+
+def _deepest(near: Near, n: int, among: np.ndarray | slice = slice(None)) -> np.ndarray:
+    """Deepest penetration (n,) at each sample, of shapes without padding, among some of the pairs."""
+    out = np.zeros(n)
+    np.maximum.at(out, near.sample[among], -(near.distance + near.padding)[among])
+    return out
 
 
 def _overlapping(a: State, b: State) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mrtamp.modes import Attachment
 from mrtamp.problem import HeldBy, RobotAt
-from mrtamp.transitions.candidate import StratumKey
+from mrtamp.transitions.candidate import Outcome, StratumKey
 from mrtamp.transitions.workspace import Workspace
 
 FAILED_CALL = 3.0
@@ -69,6 +69,8 @@ class Estimates:
         self._conditions = {c.object: c for c in problem.goal if not isinstance(c, RobotAt)}
         self._priors: dict[tuple[str, str], float] = {}
         self._known: dict[str, tuple[int, Costs]] = {}
+        self._of_item: dict[str, list[Outcome]] = {}
+        self._indexed = -1
 
     def goal_places(self, item: str) -> list[str]:
         """Names of the supports or the robot that satisfy the object's goal."""
@@ -113,13 +115,25 @@ class Estimates:
 
     def costs(self, item: str) -> Costs:
         """Costs from everywhere, by what is known now."""
-        tables = (self.workspace.outcomes, self.workspace.foreseen)
         version = self.holds.version[item]
-        version += sum(o.calls + bool(o.accepted) for table in tables for k, o in table.items() if k[2] == item)
+        version += sum(o.calls + bool(o.accepted) for o in self._outcomes(item))
         cached = self._known.get(item)
         if cached is None or cached[0] != version:
             cached = self._known[item] = (version, self._compute(item))
         return cached[1]
+
+    def _outcomes(self, item: str) -> list[Outcome]:
+        """Statistics of all strata of an object."""
+        tables = (self.workspace.outcomes, self.workspace.foreseen)
+        n = sum(len(table) for table in tables)
+        if n != self._indexed:
+            self._indexed = n
+            self._of_item = {name: [] for name in self.holds.possible}
+            for table in tables:
+                for key, outcome in table.items():
+                    if key[2]:
+                        self._of_item[key[2]].append(outcome)
+        return self._of_item[item]
 
     def _compute(self, item: str) -> Costs:
         """Costs of all edges, then those to the goal: every sweep takes in ways that are one transition longer."""
