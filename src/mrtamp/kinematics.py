@@ -9,7 +9,7 @@ translation `p` (N, 3), expressed in the world W.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -62,25 +62,35 @@ def quaternions(R: Array) -> Array:
 
 def rotation_vectors(R: Array) -> Array:
     """Rotation vectors (N, 3), angle times axis, of rotation matrices (N, 3, 3)."""
+    v = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    sine = np.sqrt((v * v).sum(axis=1))
+    cosine = R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1.0
+    scale = np.where(sine > 1e-12, np.arctan2(sine, cosine) / np.maximum(sine, 1e-300), 0.5)
+    out = v * scale[:, None]
+    # Near half a turn the axis is badly conditioned that way.
+    half = np.flatnonzero(cosine < -1.9999)
+    if len(half):
+        out[half] = _by_quaternions(R[half])
+    return out
+
+
+def _by_quaternions(R: Array) -> Array:
     q = quaternions(R)
     q = np.where(q[:, :1] < 0, -q, q)
     norm = np.linalg.norm(q[:, 1:], axis=1)
     angle = 2 * np.arctan2(norm, q[:, 0])
-    scale = np.where(norm > 1e-12, angle / np.maximum(norm, 1e-300), 2.0)
-    return q[:, 1:] * scale[:, None]
+    return q[:, 1:] * (angle / np.maximum(norm, 1e-300))[:, None]
 
 
 @dataclass
 class _Link:
-    """One body: X_WL = X_W(parent) * (R, p) * motion of its joint along or about the local z."""
+    """One body: X_WL = X_W(parent) X M X_after with poses (4, 4), and M the motion of its joint along or about z."""
 
     parent: int
-    R: Array
-    p: Array
-    kind: str
-    column: int
-    R_after: Array
-    p_after: Array
+    X: Array
+    kind: str = "weld"
+    column: int = -1
+    X_after: Array | None = None
 
 
 def _rotation_to_z(axis: Array) -> Array:
@@ -116,7 +126,7 @@ class Chain:
         self.velocity = np.empty(self.n)
         self.prismatic = np.zeros(self.n, dtype=bool)
         self.bodies: list[str] = [base]
-        self.links = [_Link(-1, X_WB.rotation().matrix(), X_WB.translation(), "weld", -1, np.eye(3), np.zeros(3))]
+        self.links = [_Link(-1, X_WB.GetAsMatrix4())]
         self.index = {base: 0}
         pending = [j for j in joints if j.child_body().name() != base]
         while pending:
@@ -131,44 +141,32 @@ class Chain:
             raise MrtampError(f"arm joints {missing} do not exist; the model has {[j.name() for j in joints]}")
 
     def _append(self, joint, arm_joints: tuple[str, ...], fixed: dict[str, float]) -> None:
-        X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
-        X_MC = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+        X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame().GetAsMatrix4()
+        X_MC = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse().GetAsMatrix4()
         kind = joint.type_name()
+        parent = self.index[joint.parent_body().name()]
         if kind == "weld":
-            X_FM = joint.X_FM()
-            before, kind, column = X_PF @ X_FM @ X_MC, "weld", -1
-            R, p = before.rotation().matrix(), before.translation()
-            R_after, p_after = np.eye(3), np.zeros(3)
+            link = _Link(parent, X_PF @ joint.X_FM().GetAsMatrix4() @ X_MC)
         elif kind in ("revolute", "prismatic"):
             axis = joint.revolute_axis() if kind == "revolute" else joint.translation_axis()
-            Z = _rotation_to_z(np.asarray(axis))
-            R, p = X_PF.rotation().matrix() @ Z, X_PF.translation()
-            R_after = Z.T @ X_MC.rotation().matrix()
-            p_after = Z.T @ X_MC.translation()
+            Z = matrix(_rotation_to_z(np.asarray(axis)), np.zeros(3))
+            X, X_after = X_PF @ Z, inverse(Z) @ X_MC
             if joint.name() in arm_joints:
                 column = arm_joints.index(joint.name())
                 self.lower[column] = joint.position_lower_limit()
                 self.upper[column] = joint.position_upper_limit()
                 self.velocity[column] = joint.velocity_upper_limit()
                 self.prismatic[column] = kind == "prismatic"
+                link = _Link(parent, X, kind, column, None if np.allclose(X_after, np.eye(4), atol=0) else X_after)
             else:
-                value = fixed.get(joint.name(), 0.0)
-                if kind == "revolute":
-                    c, s = np.cos(value), np.sin(value)
-                    M = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-                    R, p = R @ M @ R_after, p + R @ M @ p_after
-                else:
-                    p = p + R @ (p_after + np.array([0, 0, value]))
-                    R = R @ R_after
-                kind, column, R_after, p_after = "weld", -1, np.eye(3), np.zeros(3)
+                link = _Link(parent, X @ _motion(kind, fixed.get(joint.name(), 0.0)) @ X_after)
         else:
             raise MrtampError(
                 f"joint {joint.name()} is of type {kind}; arms may have revolute, prismatic and fixed joints"
             )
         self.index[joint.child_body().name()] = len(self.links)
         self.bodies.append(joint.child_body().name())
-        parent = self.index[joint.parent_body().name()]
-        self.links.append(_Link(parent, R, p, kind, column, R_after, p_after))
+        self.links.append(link)
 
     def poses(self, q: Array, bodies: list[str] | None = None) -> tuple[Array, Array]:
         """World poses of `bodies` (default: all): R (B, N, 3, 3), p (B, N, 3) for configurations q (N, n)."""
@@ -180,32 +178,45 @@ class Chain:
         """Rotations (N, 3, 3) and translations (N, 3) of all bodies in W at q (N, n), and every joint's column, axis
         (N, 3) and a point (N, 3) on that axis."""
         N = len(q)
-        cos, sin = np.cos(q), np.sin(q)
-        Rs: list[Array] = []
-        ps: list[Array] = []
+        # To turn a frame about its z is to multiply x + iy by exp(-i angle).
+        turn = np.exp(-1j * q)
+        found: list[Array] = []
         axes: list[tuple[int, Array, Array]] = []
         for link in self.links:
-            if link.parent < 0:
-                R, p = np.broadcast_to(link.R, (N, 3, 3)), np.broadcast_to(link.p, (N, 3))
-            else:
-                Rp, pp = Rs[link.parent], ps[link.parent]
-                R, p = Rp @ link.R, pp + Rp @ link.p
+            # All rows of all poses at once: far less time than a product of matrices per sample.
+            X = link.X[None, :3] if link.parent < 0 else _times(found[link.parent], link.X)
             if link.kind != "weld":
-                axes.append((link.column, R[:, :, 2], p))
+                if len(X) != N:
+                    # Nothing before this joint moves.
+                    X = np.repeat(X, N, axis=0)
+                axis, origin = X[:, :, 2], X[:, :, 3]
                 if link.kind == "revolute":
-                    c, s = cos[:, link.column, None], sin[:, link.column, None]
-                    moved = np.empty_like(R)
-                    moved[:, :, 0] = c * R[:, :, 0] + s * R[:, :, 1]
-                    moved[:, :, 1] = c * R[:, :, 1] - s * R[:, :, 0]
-                    moved[:, :, 2] = R[:, :, 2]
-                    R = moved
+                    X.view(complex)[:, :, 0] *= turn[:, link.column, None]
                 else:
-                    p = p + R[:, :, 2] * q[:, link.column, None]
-                p = p + R @ link.p_after
-                R = R @ link.R_after
-            Rs.append(R)
-            ps.append(p)
-        return Rs, ps, axes
+                    origin = origin.copy()
+                    X[:, :, 3] += axis * q[:, link.column, None]
+                axes.append((link.column, axis, origin))
+                if link.X_after is not None:
+                    X = _times(X, link.X_after)
+            found.append(X)
+        whole = [np.broadcast_to(X, (N, 3, 4)) for X in found]
+        return [X[:, :, :3] for X in whole], [X[:, :, 3] for X in whole], axes
+
+
+def _times(poses: Array, X: Array) -> Array:
+    """Poses (N, 3, 4), without their last row, times a constant one (4, 4)."""
+    return (poses.reshape(-1, 4) @ X).reshape(-1, 3, 4)
+
+
+def _motion(kind: str, value: float) -> Array:
+    """The pose (4, 4) to which a joint of value `value` (rad or m) moves along or about z."""
+    out = np.eye(4)
+    if kind == "prismatic":
+        out[2, 3] = value
+    else:
+        c, s = np.cos(value), np.sin(value)
+        out[:2, :2] = [[c, -s], [s, c]]
+    return out
 
 
 class Tool:
@@ -242,15 +253,15 @@ class Tool:
         Rs, ps, axes = self._arm.sweep(q)
         R, p = Rs[-1] @ self._R, ps[-1] + Rs[-1] @ self._p
         J = np.zeros((len(q), 6, self.chain.n))
+        arm = np.zeros((len(q), 3, self.chain.n))
         for column, axis, origin in axes:
-            if self.chain.prismatic[column]:
-                J[:, 3:, column] = axis
-            else:
-                r = p - origin
-                J[:, :3, column] = axis
-                J[:, 3, column] = axis[:, 1] * r[:, 2] - axis[:, 2] * r[:, 1]
-                J[:, 4, column] = axis[:, 2] * r[:, 0] - axis[:, 0] * r[:, 2]
-                J[:, 5, column] = axis[:, 0] * r[:, 1] - axis[:, 1] * r[:, 0]
+            J[:, :3, column] = axis
+            arm[:, :, column] = p - origin
+        (a, b, c), (x, y, z) = (np.moveaxis(v, 1, 0) for v in (J[:, :3], arm))
+        J[:, 3], J[:, 4], J[:, 5] = b * z - c * y, c * x - a * z, a * y - b * x
+        slides = self.chain.prismatic
+        if slides.any():
+            J[:, 3:, slides], J[:, :3, slides] = J[:, :3, slides], 0.0
         return R, p, J
 
 
@@ -261,16 +272,13 @@ def _sub_chain(chain: Chain, path: list[int]) -> Chain:
     links: list[_Link] = []
     for i in path:
         link = chain.links[i]
-        copy = _Link(len(links) - 1, link.R, link.p, link.kind, link.column, link.R_after, link.p_after)
-        if link.kind == "weld" and links:
-            last = links[-1]
-            if last.kind == "weld":
-                last.p = last.p + last.R @ link.p
-                last.R = last.R @ link.R
-            else:
-                last.p_after = last.p_after + last.R_after @ link.p
-                last.R_after = last.R_after @ link.R
+        if link.kind != "weld" or not links:
+            links.append(replace(link, parent=len(links) - 1))
             continue
-        links.append(copy)
+        last = links[-1]
+        if last.kind == "weld":
+            last.X = last.X @ link.X
+        else:
+            last.X_after = link.X if last.X_after is None else last.X_after @ link.X
     arm.links = links
     return arm

@@ -25,8 +25,6 @@ from .referee import Referee, legs_of
 
 CHECKPOINTS = (10.0, 60.0, 120.0)
 """Seconds at which the cost is reported, as far as the budget goes."""
-_SLICE = 0.5
-"""Seconds of planning between two looks at the clock."""
 
 
 @dataclass
@@ -57,7 +55,7 @@ def run(peer: Peer, referee: Referee, folder: Path, seed: int, budget: float) ->
     try:
         planner = Planner(problem_of(peer, folder), seed=seed)
         while (left := budget - (time.process_time() - began)) > 0:
-            for plan in planner.improve(min(left, _SLICE)):
+            for plan in planner.improve(left):
                 best = plan
                 out.costs.append((time.process_time() - began, plan.cost))
     except MrtampError as error:
