@@ -199,7 +199,7 @@ class Chain:
                 if link.X_after is not None:
                     X = _times(X, link.X_after)
             found.append(X)
-        whole = [np.broadcast_to(X, (N, 3, 4)) for X in found]
+        whole = [X if len(X) == N else np.broadcast_to(X, (N, 3, 4)) for X in found]
         return [X[:, :, :3] for X in whole], [X[:, :, 3] for X in whole], axes
 
 
@@ -257,7 +257,7 @@ class Tool:
         for column, axis, origin in axes:
             J[:, :3, column] = axis
             arm[:, :, column] = p - origin
-        (a, b, c), (x, y, z) = (np.moveaxis(v, 1, 0) for v in (J[:, :3], arm))
+        (a, b, c), (x, y, z) = ((v[:, 0], v[:, 1], v[:, 2]) for v in (J, arm))
         J[:, 3], J[:, 4], J[:, 5] = b * z - c * y, c * x - a * z, a * y - b * x
         slides = self.chain.prismatic
         if slides.any():

@@ -115,14 +115,14 @@ class Meetings:
         costs = np.append(elsewhere, min((put[self.holds.face(g)] for g in pool), default=np.inf))
         likely = _likely(costs) if np.isfinite(costs).any() else None
         other = _palms(inverse(given.X_PO))
+        ways = self.rng.choice(len(costs), size=n, p=likely)
+        guided = (self.rng.random(n) < 0.8) & (likely is not None)
         out = []
-        for _ in range(n):
-            guided = likely is not None and self.rng.random() < 0.8
-            way = int(self.rng.choice(len(costs), p=likely)) if guided else None
+        for way in np.where(guided, ways, -1).tolist():
             if way == len(elsewhere):
                 drawn = [pool[int(k)] for k in self.rng.integers(len(pool), size=_GRASP_DRAWS)]
             else:
-                numbers = families[way] if way is not None else range(len(self.families[receiver, item]))
+                numbers = families[way] if way >= 0 else range(len(self.families[receiver, item]))
                 drawn = [
                     self.workspace.draw_grasp(receiver, item, numbers[int(k)])
                     for k in self.rng.integers(len(numbers), size=_GRASP_DRAWS)

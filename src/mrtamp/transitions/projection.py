@@ -60,7 +60,7 @@ def solve_ik(
             # The rest of a large batch converges slowly or not at all; every seed has had a fair number of steps.
             if not len(active) or (k >= 14 and solved.sum() >= enough):
                 break
-        damping = 0.05 * np.einsum("ni,ni->n", e, e) + _DAMPING
+        damping = 0.05 * (e * e).sum(axis=1) + _DAMPING
         A = J @ np.swapaxes(J, 1, 2) + damping[:, None, None] * eye
         dq = (np.swapaxes(J, 1, 2) @ np.linalg.solve(A, e[:, :, None]))[:, :, 0]
         size = np.abs(dq).max(axis=1, keepdims=True)

@@ -246,14 +246,19 @@ class Ways:
         """Ways from a pick through each of the handovers to up to two places."""
         sampler = self.sampler
         out: list[Way] = []
-        for handover in handovers:
-            assert handover.after is not None
-            taken, receiver = handover.after, handover.robots[-1]
-            qb = sampler.roadmaps[receiver].q[handover.at[receiver]]
-            m = _AFTER
-            q2, which, poses, solved = self._places(receiver, [taken] * m, np.tile(qb, (m, 1)), places)
+        if not handovers:
+            return out
+        receiver = handovers[0].robots[-1]
+        into = [h.after for h in handovers if h.after is not None]
+        stands = np.array([sampler.roadmaps[receiver].q[h.at[receiver]] for h in handovers])
+        grasps = [taken for taken in into for _ in range(_AFTER)]
+        q2, which, poses, solved = self._places(receiver, grasps, np.repeat(stands, _AFTER, axis=0), places)
+        length = np.where(solved, np.linalg.norm(q2 - np.repeat(stands, _AFTER, axis=0), axis=1), np.inf)
+        for i, (handover, taken) in enumerate(zip(handovers, into, strict=True)):
+            mine = np.arange(i * _AFTER, (i + 1) * _AFTER)
+            mine = mine[solved[mine]]
             found = 0
-            for k in np.flatnonzero(solved)[np.argsort(np.linalg.norm(q2[solved] - qb, axis=1))].tolist():
+            for k in mine[np.argsort(length[mine])].tolist():
                 after = self._attachment(taken.object, places[which[k]], poses[k])
                 penalty = self._place_free(mode, receiver, taken, after, places[which[k]].chain, q2[k])
                 if not np.isfinite(penalty):
@@ -327,10 +332,7 @@ class Ways:
             X_BO[i] = family.pose(self.rng.uniform(family.lower, family.upper)[None])[0]
             X_WO[i] = X_WB @ X_BO[i]
         X_WG = X_WO @ inverse(np.array([g.X_PO for g in grasps]))
-        home = sampler.roadmaps[robot].world.home
-        kind = self.rng.random(n)[:, None]
-        seeds = np.where(kind < 0.5, q, np.where(kind < 0.8, home, sampler.maps[robot].seeds(X_WG, self.rng)))
-        q2, solved = sampler.ik(robot, X_WG, seeds + self.rng.normal(scale=0.3, size=q.shape))
+        q2, solved = sampler.ik(robot, X_WG, sampler.seeds_from(robot, X_WG, q, 0.2))
         return q2, which, X_BO, solved
 
     # -- collisions at the stops ----------------------------------------------------------------------------------

@@ -101,8 +101,19 @@ class Workspace:
         Seeds from the map converge where reach is scarce; those around home give postures that are cheap to get to.
         """
         tool = self.roadmaps[robot].world.tool
-        mixed = mixed_seeds(tool, self.rng, len(X_WG), self.near(robot))
-        return np.where(self.rng.random(len(X_WG))[:, None] < share, self.maps[robot].seeds(X_WG, self.rng), mixed)
+        out = mixed_seeds(tool, self.rng, len(X_WG), self.near(robot))
+        mapped = self.rng.random(len(X_WG)) < share
+        out[mapped] = self.maps[robot].seeds(X_WG[mapped], self.rng)
+        return out
+
+    def seeds_from(self, robot: str, X_WG: np.ndarray, q: np.ndarray, share: float) -> np.ndarray:
+        """IK seeds (N, n) for hand poses after configurations q (N, n): half near those, a share from the map, the rest
+        near home."""
+        start = self.rng.random(len(q))
+        out = np.where(start[:, None] < 0.5, q, self.roadmaps[robot].world.home)
+        mapped = start >= 1 - share
+        out[mapped] = self.maps[robot].seeds(X_WG[mapped], self.rng)
+        return out + self.rng.normal(scale=0.3, size=q.shape)
 
     def ik(self, robot: str, X_WG: np.ndarray, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         q, solved = solve_ik(self.roadmaps[robot].world.tool, X_WG[:, :3, :3], X_WG[:, :3, 3], seeds)
@@ -153,9 +164,7 @@ class Workspace:
         X_WO = np.array([places[k][2][i] for i, k in enumerate(which)])
         X_WG = X_WO @ inverse(np.array([g.X_PO for g in grasps]))
         # The posture of the pick, or of home, makes for a short way; the map helps where neither converges.
-        start = self.rng.random(len(q))[:, None]
-        seeds = np.where(start < 0.5, q, np.where(start < 0.85, world.home, self.maps[robot].seeds(X_WG, self.rng)))
-        found, solved = self.ik(robot, X_WG, seeds + self.rng.normal(scale=0.3, size=q.shape))
+        found, solved = self.ik(robot, X_WG, self.seeds_from(robot, X_WG, q, 0.15))
         for i, ok in enumerate(solved.tolist()):
             if not ok:
                 self.holds.note_place(grasps[i], False, _UNSOLVED)
