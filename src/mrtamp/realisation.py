@@ -9,6 +9,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 
+import numpy as np
+
 from mrtamp.growth import Growth, Timed
 from mrtamp.incumbent import Incumbent
 from mrtamp.optimise.yielding import Draft
@@ -19,6 +21,8 @@ from mrtamp.tensor_tree import Node
 
 _FIRST_WAYS, _MORE_WAYS = (80, 14), (64, 20)
 """IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
+_GROWTHS, _WORTH_GROWING = 3, 0.02
+"""Before the first drafts ways are sampled up to so many times, as long as skeletons get cheaper by that share."""
 _REALISATIONS = 6
 """Skeletons that are tried at a time."""
 _QUICK, _THOROUGH = 30, 300
@@ -85,7 +89,7 @@ class Realisation:
         A checked plan that the tree does not have yet, a goal node of the tree, or None; also where drafts were made.
         """
         first = self._first
-        self.skeletons.grow(*(_FIRST_WAYS if first else _MORE_WAYS))
+        self._grow()
         self.skeletons.update_bound()
         if not first and self.drafts and self._draft():
             return None
@@ -120,6 +124,22 @@ class Realisation:
             if not failed:
                 return None
         return None
+
+    def _grow(self) -> None:
+        """Sample more ways; where plans are to be drafted, until more of them hardly make skeletons cheaper."""
+        if self._first:
+            self.skeletons.grow(*_FIRST_WAYS)
+            return
+        cheapest = np.inf
+        for _ in range(_GROWTHS if self.undrafted else 1):
+            self.skeletons.grow(*_MORE_WAYS)
+            before, cheapest = cheapest, self._cheapest()
+            if cheapest > (1 - _WORTH_GROWING) * before:
+                break
+
+    def _cheapest(self) -> float:
+        """What the cheapest skeleton promises to cost."""
+        return min((p.skeleton.cost for p in self.skeletons.propose(effort=_THOROUGH)), default=np.inf)
 
     @property
     def _first(self) -> bool:
