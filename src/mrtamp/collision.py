@@ -12,7 +12,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.geometry import Box, Capsule, CollisionFilterDeclaration, Cylinder, GeometrySet, QueryObject, Sphere
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    CollisionFilterDeclaration,
+    Cylinder,
+    GeometryId,
+    GeometrySet,
+    QueryObject,
+    Sphere,
+)
 
 from mrtamp.kinematics import Chain, Tool, quaternions
 from mrtamp.modes import Attachment
@@ -209,8 +218,7 @@ class RobotWorld:
 
     def _penetrations(self, query: QueryObject, contact: str | None, slot: str | None) -> list[tuple[str, str, float]]:
         """The two owners and the depth (m) of every collision that is no touch of the slot and its contact."""
-        pairs = query.ComputePointPairPenetration()
-        found = [(self._owner[p.id_A], self._owner[p.id_B], p.depth) for p in pairs]
+        found = [(self._owner[a], self._owner[b], depth) for a, b, depth in penetrations(query)]
         return [(a, b, d) for a, b, d in found if not ({a, b} == {contact, slot} and d <= CONTACT_DEPTH)]
 
     def culprits(self, row: np.ndarray, contact: str | None = None, slot: str | None = None) -> list[tuple[str, str]]:
@@ -301,10 +309,19 @@ class RobotPair:
     def _tolerated(self, query: QueryObject) -> bool:
         """Whether the shapes as they are penetrate no more than is tolerated."""
         grown, total = self.scene.grown, 0.0
-        for p in query.ComputePointPairPenetration():
-            depth = p.depth - grown.get(p.id_A, 0.0) - grown.get(p.id_B, 0.0)
-            total += max(depth, 0.0)
+        for a, b, depth in penetrations(query):
+            total += max(depth - grown.get(a, 0.0) - grown.get(b, 0.0), 0.0)
         return total <= self.tolerance
+
+
+def penetrations(query: QueryObject) -> list[tuple[GeometryId, GeometryId, float]]:
+    """All pairs of geometries that penetrate each other, and how deep (m) they do.
+
+    Depths are negative signed distances: those of Drake's penetration query may be several times too large where a
+    capsule lies in a box, as they are not along the shortest way out.
+    """
+    pairs = [(p.id_A, p.id_B) for p in query.ComputePointPairPenetration()]
+    return [(a, b, -query.ComputeSignedDistancePairClosestPoints(a, b).distance) for a, b in pairs]
 
 
 def write_held(scene: Scene, rows: np.ndarray, slot: str, tool: Tool, q: np.ndarray, held: Attachment) -> None:
