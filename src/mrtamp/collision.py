@@ -8,7 +8,7 @@ samples only.  Where a problem tolerates some penetration, depths are asked for 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -213,13 +213,21 @@ class RobotWorld:
         return np.array([self.first_hit(row[None]) == 0 for row in rows], dtype=bool)
 
     def _tolerated(self, query: QueryObject, contact: str | None, slot: str | None) -> bool:
-        depths = [depth for _, _, depth in self._penetrations(query, contact, slot)]
-        return not depths or sum(depths) <= self.tolerance
+        total = 0.0
+        for _, _, depth in self._penetrations(query, contact, slot):
+            total += depth
+            if total > self.tolerance:
+                return False
+        return True
 
-    def _penetrations(self, query: QueryObject, contact: str | None, slot: str | None) -> list[tuple[str, str, float]]:
+    def _penetrations(
+        self, query: QueryObject, contact: str | None, slot: str | None
+    ) -> Iterator[tuple[str, str, float]]:
         """The two owners and the depth (m) of every collision that is no touch of the slot and its contact."""
-        found = [(self._owner[a], self._owner[b], depth) for a, b, depth in penetrations(query)]
-        return [(a, b, d) for a, b, d in found if not ({a, b} == {contact, slot} and d <= CONTACT_DEPTH)]
+        for one, two, depth in penetrations(query):
+            a, b = self._owner[one], self._owner[two]
+            if {a, b} != {contact, slot} or depth > CONTACT_DEPTH:
+                yield a, b, depth
 
     def culprits(self, row: np.ndarray, contact: str | None = None, slot: str | None = None) -> list[tuple[str, str]]:
         """Names of the two owners (robot, static body, object or slot) of every collision at one row."""
@@ -311,17 +319,19 @@ class RobotPair:
         grown, total = self.scene.grown, 0.0
         for a, b, depth in penetrations(query):
             total += max(depth - grown.get(a, 0.0) - grown.get(b, 0.0), 0.0)
-        return total <= self.tolerance
+            if total > self.tolerance:
+                return False
+        return True
 
 
-def penetrations(query: QueryObject) -> list[tuple[GeometryId, GeometryId, float]]:
-    """All pairs of geometries that penetrate each other, and how deep (m) they do.
+def penetrations(query: QueryObject) -> Iterator[tuple[GeometryId, GeometryId, float]]:
+    """Pairs of geometries that penetrate each other and how deep (m) they do, those likely to be the deepest first.
 
     Depths are negative signed distances: those of Drake's penetration query may be several times too large where a
-    capsule lies in a box, as they are not along the shortest way out.
+    capsule lies in a box, as they are not along the shortest way out.  Each takes a query, so stop as soon as you know.
     """
-    pairs = [(p.id_A, p.id_B) for p in query.ComputePointPairPenetration()]
-    return [(a, b, -query.ComputeSignedDistancePairClosestPoints(a, b).distance) for a, b in pairs]
+    for p in sorted(query.ComputePointPairPenetration(), key=lambda p: -p.depth):
+        yield p.id_A, p.id_B, -query.ComputeSignedDistancePairClosestPoints(p.id_A, p.id_B).distance
 
 
 def write_held(scene: Scene, rows: np.ndarray, slot: str, tool: Tool, q: np.ndarray, held: Attachment) -> None:
