@@ -53,12 +53,19 @@ class CollisionRows:
         """How far (P,) each may shrink."""
         return self.distance - self.asked
 
+    @property
+    def depth(self) -> np.ndarray:
+        """Penetration (P,) in m beyond what is allowed."""
+        return np.minimum(self.asked, 0) - self.padding - self.distance
+
     def deepest(self, tolerance: float) -> float:
-        """The largest penetration (m) beyond what is allowed."""
-        if not len(self.distance):
-            return 0.0
-        allowed = np.minimum(self.asked, 0) - self.padding
-        return max(0.0, float((allowed - self.distance).max()) - tolerance)
+        """The largest penetration (m) beyond what is allowed and tolerated."""
+        return max(0.0, float(self.depth.max(initial=0.0)) - tolerance)
+
+    def knots_beyond(self, depth: float, shape: tuple[int, int]) -> np.ndarray:
+        """Numbers of those of the knots (K, N) at or next to which some penetration is larger than `depth` (m)."""
+        columns = self.A[np.flatnonzero(self.depth > depth)].indices
+        return np.unique(columns[columns < shape[0] * shape[1]] // shape[1])
 
     def joined(self, other: CollisionRows) -> CollisionRows:
         """These rows and others."""

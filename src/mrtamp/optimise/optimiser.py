@@ -34,6 +34,8 @@ _SLIDING = 0.2
 _LARGEST, _SMALLEST = 0.5, 0.01
 _DEEP = 0.06
 """Penetration (m) at which a step is rejected."""
+_HOLD, _HELD, _RAMP = 0.02, 0.2, 4.0
+"""Where a step leads deeper than that (m) into collision, so much of it is tried; all of it so many knots away."""
 _LINGER, _LODGED, _YIELDS = 5, 0.004, 0.8
 """Steps in which a draft whose robots penetrate by more than that (m) all the time has to reduce it to that share."""
 _SHALLOW = 1e-3
@@ -219,17 +221,23 @@ class Optimiser:
         if solved is None:
             return self._reject()
         demands = self.collisions.demands
-        candidate = self._resampled(solved) if self._stretched(solved) else solved
-        where = (candidate.line, candidate.q, candidate.arrangement)
-        rows = self.collisions.rows(*where)
         before = self._merit(now, self._rows)
         tolerance = self.problem.collision.tolerance
-        deepest = rows.deepest(tolerance)
-        worse = deepest > max(_DEEP, self._rows.deepest(tolerance))
-        if worse and not (np.isinf(self.cost) and self._merit(candidate, rows) < before):
-            self._depths.append(self._rows.deepest(tolerance))
+        enough = max(_DEEP, self._rows.deepest(tolerance))
+        candidate, rows, u = self._looked_at(solved)
+        if self._too_deep(candidate, rows, enough, before):
             self.collisions.demands = demands
-            return self._reject()
+            held_back = self._held_back(
+                now, solved, u[rows.knots_beyond(tolerance + _HOLD, candidate.q.shape)].astype(float)
+            )
+            if held_back is not None:
+                candidate, rows, _ = self._looked_at(held_back)
+            if held_back is None or self._too_deep(candidate, rows, enough, before):
+                self._depths.append(self._rows.deepest(tolerance))
+                self.collisions.demands = demands
+                return self._reject()
+        deepest = rows.deepest(tolerance)
+        where = (candidate.line, candidate.q, candidate.arrangement)
         self._depths.append(deepest)
         self._now = candidate
         if candidate.line is not now.line:
@@ -249,6 +257,25 @@ class Optimiser:
         self._clear_up(clean)
         self._pace(before, after, self._promise + self._changes, clean)
         return gain
+
+    def _looked_at(self, solved: Iterate) -> tuple[Iterate, CollisionRows, np.ndarray]:
+        """What a program leads to, its knots spread evenly where steps have become too long; its collision rows, and
+        where its knots (K,) were before."""
+        candidate, u = self._resampled(solved) if self._stretched(solved) else (solved, np.arange(solved.line.knots))
+        return candidate, self.collisions.rows(candidate.line, candidate.q, candidate.arrangement), u
+
+    def _too_deep(self, x: Iterate, rows: CollisionRows, enough: float, before: float) -> bool:
+        """Whether an iterate collides more than is worth following, for all that a draft gains."""
+        deep = rows.deepest(self.problem.collision.tolerance) > enough
+        return deep and not (np.isinf(self.cost) and self._merit(x, rows) < before)
+
+    def _held_back(self, now: Iterate, solved: Iterate, deep: np.ndarray) -> Iterate | None:
+        """The step with less of it near knots (M,) that would be deep in collision; None where it cannot be had."""
+        away = np.abs(np.arange(now.line.knots)[:, None] - deep).min(axis=1, initial=np.inf)
+        share = np.clip(_HELD + (1 - _HELD) * (away - 1) / _RAMP, _HELD, 1.0)
+        q = self._clipped(now.q + share[:, None] * (solved.q - now.q))
+        projected = self._closure.project(q, solved.arrangement)
+        return None if projected is None else self._iterate(now.line, self._clipped(projected), solved.arrangement)
 
     def _pace(self, before: float, after: float, promised: float, clean: bool) -> None:
         """Adapt the trust region to how much of the promised gain came true."""
@@ -389,17 +416,17 @@ class Optimiser:
         """Whether steps have become too long."""
         return bool(x.line.lengths(x.q).max(initial=0.0) > 1.4 * self.knot)
 
-    def _resampled(self, x: Iterate) -> Iterate:
-        """An iterate with its knots spread evenly again; demands move along."""
+    def _resampled(self, x: Iterate) -> tuple[Iterate, np.ndarray]:
+        """An iterate with its knots spread evenly again, and where they were before (K,); demands move along."""
         line = Polyline(x.line.columns, x.q, x.line.events, x.line.stretches)
         u = line.resampled(self.knot, self.collisions.level)
         fresh = line.at(u)
         self.collisions.move(u)
-        return self._iterate(fresh, fresh.q, x.arrangement)
+        return self._iterate(fresh, fresh.q, x.arrangement), u
 
     def _resample(self) -> None:
         """Spread the knots of the current iterate evenly again."""
-        self._now, self._rows = self._resampled(self._now), None
+        self._now, self._rows = self._resampled(self._now)[0], None
         self._adopt(self._now)
 
     def _adopt(self, x: Iterate) -> None:
