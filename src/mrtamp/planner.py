@@ -205,12 +205,14 @@ class Planner:
             while not self.deadline.passed and self.iteration < stop and self._to_beat() > 0:
                 activity = self._next_activity()
                 began, before = time.perf_counter(), self._cost()
+                # What refinement is about to find anyway is no gain of others.
+                expected = before if activity == "refinement" else min(before, self.portfolio.outlook)
                 with suppress(TimeIsUp):
                     activities[activity]()
                 self.iteration += 1
                 work = time.perf_counter() - began if self._timed else 1.0
                 if np.isfinite(before):
-                    self._effort.record(activity, work, before - self._cost())
+                    self._effort.record(activity, work, max(expected - self._cost(), 0.0))
                 else:
                     self._tried[activity] += work
                 self._spent = self._elapsed()

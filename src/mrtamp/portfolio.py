@@ -178,6 +178,11 @@ class Portfolio:
         """Whether a plan is on trial: until it is over, more plans would only wait."""
         return any(e.on_trial for e in self._entries)
 
+    @property
+    def outlook(self) -> float:
+        """The least that a plan under refinement is likely to cost soon."""
+        return min((e.outlook for e in self._entries), default=np.inf)
+
     def idle(self, incumbent: float) -> bool:
         """Whether no plan promises a gain any more."""
         return all(e.done and (e.fruitless >= _ROUNDS or e.cost >= _HOPELESS * incumbent) for e in self._entries)
@@ -219,26 +224,29 @@ class Portfolio:
             entry.before = entry.plan.cost
         gain = entry.refiner.improve(_SLICE)
         entry.proposals += _SLICE
-        plan = self._offer(entry, incumbent, entry.refiner)
-        if entry.refiner is None:
-            return plan
         size = len(self.validity.roadmaps) * max(len(entry.plan.transitions), 1)
         enough = entry.proposals >= (_SHORTENING * size if self.convex else _ALONE)
-        if enough or (entry.proposals > 2 * _SLICE and gain < _STALE * entry.cost):
-            if self.convex:
-                self._begin_convex(entry)
-            elif enough:
-                self._finish(entry)
+        over = enough or (self.convex and entry.proposals > 2 * _SLICE and gain < _STALE * entry.cost)
+        if self.convex and not over:
+            # Convex programming follows within moments: the judge, who takes longer, is asked once.
+            return None
+        plan = self._offer(entry, incumbent, entry.refiner)
+        if entry.refiner is None or not over:
+            return plan
+        if self.convex:
+            self._begin_convex(entry, entry.refiner, judged=plan is not None)
+        else:
+            self._finish(entry)
         return plan
 
-    def _begin_convex(self, entry: _Entry) -> None:
+    def _begin_convex(self, entry: _Entry, work: Refiner, *, judged: bool) -> None:
         """Go on from the shortened plan, if the judge agrees with it, else from the plan it was made from."""
-        assert entry.refiner is not None
-        plan = self.incumbent.accepted(entry.refiner.segments(), entry.refiner.transitions)
-        if plan is not None:
-            entry.plan = plan
-        else:
-            entry.resolution /= 2
+        if not judged:
+            plan = self.incumbent.accepted(work.segments(), work.transitions)
+            if plan is not None:
+                entry.plan = plan
+            else:
+                entry.resolution /= 2
         entry.refiner = None
         entry.optimiser = self._optimiser(entry)
 
