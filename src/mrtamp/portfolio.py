@@ -200,23 +200,16 @@ class Portfolio:
         trial = [e for e in self._entries if e.on_trial]
         if trial:
             return trial[-1]
-        rested = [e for e in self._entries if e.done and e.fruitless < _ROUNDS and e.cost < _HOPELESS * incumbent]
-        best = [e for e in rested if e.rounds == 1 and e.cost < (1 + WORTH_CHECKING) * incumbent]
-        if best:
-            return self._again(best[0])
         going = [e for e in self._entries if not e.done and e.outlook < _HOPELESS * incumbent]
         if going:
             return min(going, key=lambda e: e.outlook)
         waiting = [e for e in self._entries if not e.done]
+        rested = [e for e in self._entries if e.done and e.fruitless < _ROUNDS and e.cost < _HOPELESS * incumbent]
         if rested:
-            return self._again(min(rested, key=lambda e: e.cost * (1 + 0.02 * e.fruitless)))
+            entry = min(rested, key=lambda e: e.cost * (1 + 0.02 * e.fruitless))
+            entry.refiner, entry.optimiser, entry.proposals, entry.done = None, None, 0, False
+            return entry
         return min(waiting, key=lambda e: e.cost, default=None)
-
-    @staticmethod
-    def _again(entry: _Entry) -> _Entry:
-        """Begin another round with a plan that had converged."""
-        entry.refiner, entry.optimiser, entry.proposals, entry.done = None, None, 0, False
-        return entry
 
     def _shorten(self, entry: _Entry, incumbent: float) -> Plan | None:
         if entry.refiner is None:

@@ -225,17 +225,19 @@ class Optimiser:
         tolerance = self.problem.collision.tolerance
         enough = max(_DEEP, self._rows.deepest(tolerance))
         candidate, rows, u = self._looked_at(solved)
-        if self._too_deep(candidate, rows, enough, before):
+        too_deep = self._too_deep(candidate, rows, enough, before)
+        if too_deep and np.isfinite(self.cost):
+            # Drafts that have to be pulled apart do better with smaller steps everywhere.
             self.collisions.demands = demands
-            held_back = self._held_back(
-                now, solved, u[rows.knots_beyond(tolerance + _HOLD, candidate.q.shape)].astype(float)
-            )
+            deep = u[rows.knots_beyond(tolerance + _HOLD, candidate.q.shape)].astype(float)
+            held_back = self._held_back(now, solved, deep)
             if held_back is not None:
                 candidate, rows, _ = self._looked_at(held_back)
-            if held_back is None or self._too_deep(candidate, rows, enough, before):
-                self._depths.append(self._rows.deepest(tolerance))
-                self.collisions.demands = demands
-                return self._reject()
+                too_deep = self._too_deep(candidate, rows, enough, before)
+        if too_deep:
+            self._depths.append(self._rows.deepest(tolerance))
+            self.collisions.demands = demands
+            return self._reject()
         deepest = rows.deepest(tolerance)
         where = (candidate.line, candidate.q, candidate.arrangement)
         self._depths.append(deepest)
