@@ -10,9 +10,18 @@ import numpy as np
 import pytest
 from discs import HEIGHT, RADIUS, disc_problem
 from gantry import gantry_model, gantry_problem, gantry_urdf, grasp
-from pydrake.math import RigidTransform
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    FramePoseVector,
+    GeometryFrame,
+    GeometryInstance,
+    ProximityProperties,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RollPitchYaw
 
-from mrtamp.collision import CONTACT_DEPTH, PADDING, Collision, Counts, bisection_order
+from mrtamp.collision import CONTACT_DEPTH, PADDING, Collision, Counts, bisection_order, penetrations
 from mrtamp.modes import Attachment, start_mode
 from mrtamp.problem import CollisionRules, Gripper, MrtampError, Problem
 from mrtamp.scene import build_scene, geometry_ids
@@ -268,3 +277,33 @@ def test_every_check_is_counted(problem: Problem) -> None:
 def test_attachments_are_compared_by_identity() -> None:
     X = np.eye(4)
     assert Attachment("a", "b", X) != Attachment("a", "b", X), "they are cache keys"
+
+
+def test_depths_of_penetration_are_along_the_shortest_way_out() -> None:
+    """Capsules whose axes stay outside a box: radius less the distance of the axis, by the nearest of many points."""
+    rng = np.random.default_rng(0)
+    size, radius, length = np.array([1.0, 1.0, 0.1]), 0.06, 0.5
+    graph = SceneGraph()
+    source = graph.RegisterSource("test")
+    box = graph.RegisterAnchoredGeometry(source, GeometryInstance(RigidTransform(), Box(*size), "box"))
+    frame = graph.RegisterFrame(source, GeometryFrame("arm"))
+    capsule = graph.RegisterGeometry(
+        source, frame, GeometryInstance(RigidTransform(), Capsule(radius, length), "capsule")
+    )
+    for geometry in (box, capsule):
+        graph.AssignRole(source, geometry, ProximityProperties())
+    context = graph.CreateDefaultContext()
+    t = np.linspace(-length / 2, length / 2, 20001)
+    seen = 0
+    while seen < 40:
+        X = RigidTransform(RollPitchYaw(rng.uniform(-3, 3, 3)), rng.uniform(-0.7, 0.7, 3))
+        axis = X.translation() + t[:, None] * X.rotation().matrix()[:, 2]
+        away = np.linalg.norm(np.maximum(np.abs(axis) - size / 2, 0.0), axis=1).min()
+        if not 1e-3 < away < radius - 1e-3:
+            continue
+        seen += 1
+        poses = FramePoseVector()
+        poses.set_value(frame, X)
+        graph.get_source_pose_port(source).FixValue(context, poses)
+        [(_, _, depth)] = penetrations(graph.get_query_output_port().Eval(context))
+        assert depth == pytest.approx(radius - away, abs=2e-5)
