@@ -8,7 +8,7 @@ samples only.  Where a problem tolerates some penetration, depths are asked for 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,8 +17,8 @@ from pydrake.geometry import (
     Capsule,
     CollisionFilterDeclaration,
     Cylinder,
-    GeometryId,
     GeometrySet,
+    PenetrationAsPointPair,
     QueryObject,
     Sphere,
 )
@@ -213,26 +213,25 @@ class RobotWorld:
         return np.array([self.first_hit(row[None]) == 0 for row in rows], dtype=bool)
 
     def _tolerated(self, query: QueryObject, contact: str | None, slot: str | None) -> bool:
-        total = 0.0
-        for _, _, depth in self._penetrations(query, contact, slot):
-            total += depth
-            if total > self.tolerance:
-                return False
-        return True
+        found = self._penetrations(query, contact, slot)
+        if self.tolerance == 0.0:
+            return next(found, None) is None
+        return within(self.tolerance, (depth_of(query, p) for p in found))
 
     def _penetrations(
         self, query: QueryObject, contact: str | None, slot: str | None
-    ) -> Iterator[tuple[str, str, float]]:
-        """The two owners and the depth (m) of every collision that is no touch of the slot and its contact."""
-        for one, two, depth in penetrations(query):
-            a, b = self._owner[one], self._owner[two]
-            if {a, b} != {contact, slot} or depth > CONTACT_DEPTH:
-                yield a, b, depth
+    ) -> Iterator[PenetrationAsPointPair]:
+        """Collisions that are no touch of the slot and its contact, those likely to be the deepest first."""
+        for p in sorted(query.ComputePointPairPenetration(), key=lambda p: -p.depth):
+            touching = {self._owner[p.id_A], self._owner[p.id_B]} == {contact, slot}
+            if not touching or (p.depth > CONTACT_DEPTH and depth_of(query, p) > CONTACT_DEPTH):
+                yield p
 
     def culprits(self, row: np.ndarray, contact: str | None = None, slot: str | None = None) -> list[tuple[str, str]]:
         """Names of the two owners (robot, static body, object or slot) of every collision at one row."""
         self._plant.SetPositions(self.context, row)
-        return [(a, b) for a, b, _ in self._penetrations(self._port.Eval(self.context), contact, slot)]
+        found = self._penetrations(self._port.Eval(self.context), contact, slot)
+        return [(self._owner[p.id_A], self._owner[p.id_B]) for p in found]
 
 
 class RobotPair:
@@ -316,22 +315,34 @@ class RobotPair:
 
     def _tolerated(self, query: QueryObject) -> bool:
         """Whether the shapes as they are penetrate no more than is tolerated."""
-        grown, total = self.scene.grown, 0.0
-        for a, b, depth in penetrations(query):
-            total += max(depth - grown.get(a, 0.0) - grown.get(b, 0.0), 0.0)
-            if total > self.tolerance:
-                return False
-        return True
+        grown = self.scene.grown
+        found = sorted(query.ComputePointPairPenetration(), key=lambda p: -p.depth)
+        padding = [grown.get(p.id_A, 0.0) + grown.get(p.id_B, 0.0) for p in found]
+        if sum(max(p.depth - extra, 0.0) for p, extra in zip(found, padding, strict=True)) <= self.tolerance:
+            return True
+        return within(self.tolerance, (depth_of(query, p) - extra for p, extra in zip(found, padding, strict=True)))
 
 
-def penetrations(query: QueryObject) -> Iterator[tuple[GeometryId, GeometryId, float]]:
-    """Pairs of geometries that penetrate each other and how deep (m) they do, those likely to be the deepest first.
+def within(tolerance: float, depths: Iterable[float]) -> bool:
+    """Whether penetrations (m) add up to no more than is tolerated; asks for no more of them than it takes to know."""
+    total = 0.0
+    for depth in depths:
+        total += max(depth, 0.0)
+        if total > tolerance:
+            return False
+    return True
 
-    Depths are negative signed distances: those of Drake's penetration query may be several times too large where a
-    capsule lies in a box, as they are not along the shortest way out.  Each takes a query, so stop as soon as you know.
+
+def depth_of(query: QueryObject, p: PenetrationAsPointPair) -> float:
+    """How deep (m) two geometries penetrate each other: along the shortest way out, the negative signed distance.
+
+    The depth that comes with `p` is an upper bound only, several times too large where a capsule lies in a box.  It has
+    to do where Drake's search for the distance does not converge, which happens, if rarely, for boxes face to face.
     """
-    for p in sorted(query.ComputePointPairPenetration(), key=lambda p: -p.depth):
-        yield p.id_A, p.id_B, -query.ComputeSignedDistancePairClosestPoints(p.id_A, p.id_B).distance
+    try:
+        return -float(query.ComputeSignedDistancePairClosestPoints(p.id_A, p.id_B).distance)
+    except RuntimeError:
+        return float(p.depth)
 
 
 def write_held(scene: Scene, rows: np.ndarray, slot: str, tool: Tool, q: np.ndarray, held: Attachment) -> None:
