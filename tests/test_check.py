@@ -673,3 +673,21 @@ def test_segment_distances_agree_with_sampling() -> None:
 def test_the_bar_is_as_long_as_the_script_thinks() -> None:
     # Both hands grip it 70 mm from its middle; they are 40 mm long, so 100 mm stay between them.
     assert BAR[0] / 2 > 0.07 + 0.02
+
+
+def test_the_judge_goes_on_where_drake_finds_no_distance(problem: Problem) -> None:
+    """Drake raises where its search does not converge: then what penetrates is as deep as it may be, the rest touches."""
+    world = JudgeScene(problem)
+
+    class Pair:
+        id_A, id_B, depth = world.solids[0].id, world.solids[1].id, 0.25
+
+    class Query:
+        def ComputeSignedDistancePairClosestPoints(self, a: object, b: object) -> None:
+            raise RuntimeError("max distance iterations: 1000")
+
+        def ComputePointPairPenetration(self) -> list:
+            return [Pair()]
+
+    assert world.distance(Query(), 1, 0) == -0.25
+    assert world.distance(Query(), 2, 0) == 0.0

@@ -298,8 +298,16 @@ class JudgeScene:
         return {(i, j): max(-self.distance(query, i, j), 0.0) for i, j in pairs if self.may_collide(i, j)}
 
     def distance(self, query, i: int, j: int) -> float:
-        """Signed distance (m) of two solids; collision filters do not apply."""
-        return query.ComputeSignedDistancePairClosestPoints(self.solids[i].id, self.solids[j].id).distance
+        """Signed distance (m) of two solids; collision filters do not apply.
+
+        Where Drake's search does not converge, which it may not for faces that touch, it is no more than that.
+        """
+        a, b = self.solids[i].id, self.solids[j].id
+        try:
+            return query.ComputeSignedDistancePairClosestPoints(a, b).distance
+        except RuntimeError:
+            depths = [p.depth for p in query.ComputePointPairPenetration() if {p.id_A, p.id_B} == {a, b}]
+            return -max(depths, default=0.0)
 
 
 def pose_coordinates(X: np.ndarray) -> np.ndarray:
