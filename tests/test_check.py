@@ -676,7 +676,7 @@ def test_the_bar_is_as_long_as_the_script_thinks() -> None:
 
 
 def test_the_judge_goes_on_where_drake_finds_no_distance(problem: Problem) -> None:
-    """Drake raises where its search does not converge: then what penetrates is as deep as it may be, the rest touches."""
+    """Drake raises where its search does not converge: what penetrates is as deep as it may be, the rest touches."""
     world = JudgeScene(problem)
 
     class Pair:
