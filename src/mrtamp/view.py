@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import html
 import json
-import logging
 import os
 import re
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -28,6 +26,7 @@ from mrtamp.kinematics import quaternions
 from mrtamp.plan import Plan
 from mrtamp.playback import Playback, standstill
 from mrtamp.problem import Problem
+from mrtamp.quiet import quiet
 from mrtamp.report import cost_text, timeline
 from mrtamp.stage import GHOSTS, REGIONS, TRACES, Stage, robot_color
 
@@ -258,7 +257,7 @@ def inline(what: Plan | Problem, height: int = 560) -> InlinePage:
 
 def _page(what: Plan | Problem) -> str:
     plan = standstill(what) if isinstance(what, Problem) else what
-    with _quiet():
+    with quiet():
         meshcat = _recorder()
         stage = Stage(plan.problem, meshcat)
         playback = Playback(plan)
@@ -284,18 +283,6 @@ def _local_meshcat() -> Meshcat:
     params.host = "localhost"
     params.show_stats_plot = False
     return Meshcat(params)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep Drake from announcing a window that nobody is meant to open, and from listing textures it can do without."""
-    logger = logging.getLogger("drake")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
 
 
 def _draw_traces(stage: Stage, playback: Playback) -> None:

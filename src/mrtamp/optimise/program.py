@@ -11,6 +11,7 @@ from scipy import sparse
 
 from mrtamp.optimise.polyline import Polyline
 from mrtamp.problem import CostWeights
+from mrtamp.quiet import quiet
 
 PENALTY = 20.0
 """Cost of a metre of penetration, relative to that of a radian of motion."""
@@ -177,5 +178,6 @@ def _optimum(program: MathematicalProgram, tolerance: float, *, refinement: bool
     for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas"):
         options.SetOption(solver.id(), name, tolerance)
     options.SetOption(solver.id(), "iterative_refinement_enable", int(refinement))
-    result = solver.Solve(program, None, options)
+    with quiet():
+        result = solver.Solve(program, None, options)
     return result if result.is_success() else None
