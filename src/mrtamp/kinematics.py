@@ -157,7 +157,7 @@ class Chain:
                 self.upper[column] = joint.position_upper_limit()
                 self.velocity[column] = joint.velocity_upper_limit()
                 self.prismatic[column] = kind == "prismatic"
-                link = _Link(parent, X, kind, column, None if np.allclose(X_after, np.eye(4), atol=0) else X_after)
+                link = _Link(parent, X, kind, column, None if np.array_equal(X_after, np.eye(4)) else X_after)
             else:
                 link = _Link(parent, X @ _motion(kind, fixed.get(joint.name(), 0.0)) @ X_after)
         else:

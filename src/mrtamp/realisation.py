@@ -127,11 +127,11 @@ class Realisation:
 
     def _grow(self) -> None:
         """Sample more ways; where plans are to be drafted, until more of them hardly make skeletons cheaper."""
-        if self._first:
-            self.skeletons.grow(*_FIRST_WAYS)
+        self.skeletons.grow(*(_FIRST_WAYS if self._first else _MORE_WAYS))
+        if self._first or not self.undrafted:
             return
-        cheapest = np.inf
-        for _ in range(_GROWTHS if self.undrafted else 1):
+        cheapest = self._cheapest()
+        for _ in range(_GROWTHS - 1):
             self.skeletons.grow(*_MORE_WAYS)
             before, cheapest = cheapest, self._cheapest()
             if cheapest > (1 - _WORTH_GROWING) * before:
