@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from arena import XY, Parts, arena
 
+from mrtamp.check_report import Report, Side, Violation
 from mrtamp.modes import Mode
 from mrtamp.plan import measures
 from mrtamp.space_time import STEP, Clearances, Leg, SpaceTime
@@ -154,6 +155,22 @@ def test_who_is_scheduled_alone_stands_and_acts_inside_others(tmp_path: Path) ->
         assert t.time.in_the_way(leg) == ([] if alone else ["b"])
         assert t.time.insert(leg, certain=True), "scheduled even where it is not free"
         assert t.time.happen(("a",)) == alone
+
+
+def test_a_step_that_the_judge_objected_to_is_not_taken_again(tmp_path: Path) -> None:
+    """Side by side the discs are clear of each other: only what is said against the step keeps them apart in time."""
+    t = Timing(tmp_path, {"a": (-1, 0.5), "b": (-1, -0.5)})
+    assert t.go("a", (1, 0.5)) and t.go("b", (1, -0.5))
+    end = t.time.end
+    sides = (Side("robot", "a", "disc"), Side("robot", "b", "disc"))
+    step = Violation("collision", "they graze", segment=0, step=2, fraction=0.5, value=1e-3, sides=sides)
+    assert t.time.forbid(Report([step]))
+    assert not t.time.forbid(Report([Violation("goal", "not there")])), "nothing to learn from"
+    again = SpaceTime(t.clearances, {r: t.clearances.tables[r][0] for r in "ab"}, [t.mode])
+    again.at = {r: 0 for r in "ab"}
+    rows = {r: [m.a for m in t.time.moves[r]] + [t.time.at[r]] for r in "ab"}
+    assert again.insert(Leg({"a": rows["a"]}, t.mode)) and again.insert(Leg({"b": rows["b"]}, t.mode))
+    assert again.end == end + 1, "one of them waits once"
 
 
 def test_copies_are_independent(tmp_path: Path) -> None:

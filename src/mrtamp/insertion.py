@@ -59,6 +59,7 @@ class Insertion:
     Attributes
     ----------
     stuck : number of a stop that could not be reached when the last attempt failed; None if it did not.
+    schedule : of the last attempt, if it succeeded.
     """
 
     def __init__(
@@ -75,6 +76,7 @@ class Insertion:
         self.steering = steering
         self.rng = rng
         self.stuck: int | None = None
+        self.schedule: SpaceTime | None = None
         self._rows = RoadmapRows(roadmaps, collision, validity)
         # Of one attempt: the transitions at its stops as far as they were asked for, and its `variety`.
         self._known: dict[tuple[int, Mode], Candidate | None] = {}
@@ -109,7 +111,7 @@ class Insertion:
         ------
         TimeIsUp : the deadline of `steering` has passed.
         """
-        self.stuck = None
+        self.stuck = self.schedule = None
         self._variety = variety
         self._known.clear()
         self._rows.forget_if_full()
@@ -142,6 +144,7 @@ class Insertion:
         if home is None:
             self.stuck = len(robots) - 1
             return None
+        self.schedule = home.time
         return home.time.segments(), list(state.transitions)
 
     @staticmethod

@@ -8,6 +8,7 @@ MECHANISMS = {
     "modal-guidance": "optimistic modal guidance before the first plan; without it orbits and transitions are random",
     "orbit-path-guidance": "after the first plan, half of the search works along the incumbent's orbits",
     "skeletons": "guidance that knows costs: whole skeletons from decoupled distances",
+    "way-descent": "sampled ways are shortened along their strata before skeletons choose among them",
     "lazy-validation": "roadmap edges are validated when a search asks; without it, all of them when they are made",
     "factored-cache": "what is known of an edge in one mode counts in others; without it every mode asks again",
     "rewiring": "after the first plan the tree is rewired to tensor neighbours, inside orbits and across transitions",

@@ -25,6 +25,7 @@ from mrtamp.incumbent import Incumbent
 from mrtamp.intra_orbit.planners import INTRA_ORBIT
 from mrtamp.mechanisms import check_without
 from mrtamp.modes import Mode, start_mode
+from mrtamp.optimise.descent import Descent
 from mrtamp.orbit_guidance import OrbitGuidance
 from mrtamp.orbit_sampling import OrbitSampling
 from mrtamp.plan import Plan, Transition
@@ -158,6 +159,7 @@ class Planner:
             self.portfolio,
             self.root,
             self._to_beat,
+            descent=Descent(self.sampler, self.portfolio.nearness) if self._uses("way-descent") else None,
             drafts=self._uses("drafts"),
         )
         self._effort = Effort(
@@ -212,7 +214,11 @@ class Planner:
                 self.iteration += 1
                 work = time.perf_counter() - began if self._timed else 1.0
                 if np.isfinite(before):
-                    self._effort.record(activity, work, max(expected - self._cost(), 0.0))
+                    gain = max(expected - self._cost(), 0.0)
+                    self._effort.record(activity, work, gain)
+                    if activity == "refinement" and self.portfolio.drafted:
+                        # Without the draft there would be nothing to refine.
+                        self._effort.record("skeletons", 0.0, gain)
                 else:
                     self._tried[activity] += work
                 self._spent = self._elapsed()

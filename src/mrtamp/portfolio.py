@@ -116,8 +116,10 @@ class Portfolio:
         self._seen: set[float] = set()
         self._share = 0.0
         """The least that a draft has cost in the end, relative to its estimate."""
-        self._nearness = Nearness(validity.collision)
-        self.yielding = Yielding(problem, self._nearness)
+        self.drafted = False
+        """Whether what was worked on last came from a draft and has not converged since."""
+        self.nearness = Nearness(validity.collision)
+        self.yielding = Yielding(problem, self.nearness)
 
     def add(self, plan: Plan) -> bool:
         """Put a checked plan under refinement; False if one like it is or was."""
@@ -127,6 +129,10 @@ class Portfolio:
         self._seen.add(round(plan.cost, 6))
         self._admit([_Entry(plan)])
         return True
+
+    def worth_drafting(self, incumbent: float) -> float:
+        """Estimate below which drafts may come to beat the incumbent, from what became of those so far."""
+        return _NEARLY * incumbent / self._share if self._share else incumbent
 
     def knows(self, transitions: Sequence[Transition]) -> bool:
         """Whether a plan with the same order of events is under refinement."""
@@ -162,6 +168,7 @@ class Portfolio:
     def improve(self, incumbent: float) -> Plan | None:
         """Give one plan its turn; a checked plan when it is clearly cheaper than `incumbent`."""
         entry = self._choose(incumbent)
+        self.drafted = entry is not None and np.isfinite(entry.estimate)
         if entry is None:
             return None
         if entry.optimiser is None:
@@ -192,8 +199,8 @@ class Portfolio:
 
         Drafts are given up once no draft so far has ended cheap enough for them to matter.
         """
-        enough = _NEARLY * incumbent
-        self._entries = [e for e in self._entries if not (e.draft and self._share * e.estimate > enough)]
+        most = self.worth_drafting(incumbent)
+        self._entries = [e for e in self._entries if not (e.draft and self._share and e.estimate > most)]
         near = [e for e in self._entries if e.optimiser is not None and e.outlook < _NEARLY * incumbent]
         if near:
             return min(near, key=lambda e: e.outlook)
@@ -246,7 +253,7 @@ class Portfolio:
     def _optimiser(self, entry: _Entry) -> Optimiser:
         return Optimiser(
             self.problem,
-            self._nearness,
+            self.nearness,
             entry.plan.segments,
             entry.plan.transitions,
             self.sampler.families,

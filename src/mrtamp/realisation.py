@@ -13,14 +13,18 @@ import numpy as np
 
 from mrtamp.growth import Growth, Timed
 from mrtamp.incumbent import Incumbent
+from mrtamp.optimise.descent import Descent
 from mrtamp.optimise.yielding import Draft
 from mrtamp.plan import Plan, plan_cost
 from mrtamp.portfolio import Portfolio
 from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
+from mrtamp.space_time import SpaceTime
 from mrtamp.tensor_tree import Node
 
 _FIRST_WAYS, _MORE_WAYS = (80, 14), (64, 20)
 """IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
+_FIRST_SHORTENED, _SHORTENED = 16, 40
+"""Of these, how many are shortened."""
 _GROWTHS, _WORTH_GROWING = 3, 0.02
 """Before the first drafts ways are sampled up to so many times, as long as skeletons get cheaper by that share."""
 _REALISATIONS = 6
@@ -39,6 +43,8 @@ _DETERRENT = 100.0
 """By how many times dearer a skeleton seems for a conflict of 1 in its draft."""
 _POOR = 2.0
 """A first realisation that costs so many times what its skeleton promised is not the only one."""
+_MENDINGS = 8
+"""Times that a realisation is judged, steps to which the judge objected being forbidden before the next."""
 _MANY = 12
 """Stops from which on a realisation takes too long for that."""
 
@@ -53,6 +59,7 @@ class Realisation:
     incumbent : has plans judged.  portfolio : takes drafts, and knows which orders of events are under refinement.
     root : the tree's root, where every skeleton starts.
     to_beat : cost that a skeleton has to promise less than.
+    descent : shortens ways along their strata, once there is a plan; None: they stay as they were sampled.
     drafts : whether skeletons are also put under refinement as they are.
 
     Attributes
@@ -69,6 +76,7 @@ class Realisation:
         root: Node,
         to_beat: Callable[[], float],
         *,
+        descent: Descent | None = None,
         drafts: bool = True,
     ) -> None:
         self.growth = growth
@@ -77,6 +85,7 @@ class Realisation:
         self.portfolio = portfolio
         self.root = root
         self.to_beat = to_beat
+        self.descent = descent
         self.drafts = drafts and portfolio.convex
         self.undrafted = self.drafts
         self._turn = 0
@@ -96,7 +105,7 @@ class Realisation:
         tries = 0
         while tries < _REALISATIONS:
             failed: set[int] = set()
-            inserted: list[tuple[float, Timed, Proposal]] = []
+            inserted: list[tuple[float, Timed, SpaceTime, Proposal]] = []
             for proposal in self.skeletons.propose(self.to_beat(), _QUICK if first else _THOROUGH):
                 if failed & {id(way) for _, way in proposal.stops}:
                     # The guidance has learnt something about these since.
@@ -116,26 +125,55 @@ class Realisation:
                 if tries >= _REALISATIONS:
                     break
             # An order of events that is under refinement already has had its chance.
-            for _, timed, proposal in sorted(inserted, key=lambda x: (self.portfolio.knows(x[1][1]), x[0])):
-                plan = self.incumbent.accepted(*timed)
+            for _, timed, schedule, proposal in sorted(inserted, key=lambda x: (self.portfolio.knows(x[1][1]), x[0])):
+                plan = self._judged(timed, schedule, proposal)
                 if plan is not None:
                     self.skeletons.realised(proposal)
                     return plan
+                failed |= self.skeletons.refused(proposal)
             if not failed:
                 return None
         return None
 
+    def _judged(self, timed: Timed | None, schedule: SpaceTime | None, proposal: Proposal) -> Plan | None:
+        """The plan of a realisation if the judge accepts it, after some attempts without the steps it objected to."""
+        for _ in range(_MENDINGS):
+            if timed is None or schedule is None:
+                return None
+            plan = self.incumbent.plan(*timed)
+            report = self.incumbent.judge(plan)
+            if report.ok:
+                return plan
+            # Something slipped between the samples.
+            if not schedule.forbid(report):
+                return None
+            timed = self.growth.insert(proposal, self.skeletons, self.root)
+            schedule = self.growth.insertion.schedule
+        return None
+
     def _grow(self) -> None:
         """Sample more ways; where plans are to be drafted, until more of them hardly make skeletons cheaper."""
-        self.skeletons.grow(*(_FIRST_WAYS if self._first else _MORE_WAYS))
-        if self._first or not self.undrafted:
+        if self._first:
+            self.skeletons.grow(*_FIRST_WAYS)
+            if self.descent is not None:
+                self.skeletons.shorten(self.descent, _FIRST_SHORTENED)
+            return
+        self._more_ways()
+        if not self.undrafted:
             return
         cheapest = self._cheapest()
         for _ in range(_GROWTHS - 1):
-            self.skeletons.grow(*_MORE_WAYS)
+            self._more_ways()
             before, cheapest = cheapest, self._cheapest()
             if cheapest > (1 - _WORTH_GROWING) * before:
                 break
+
+    def _more_ways(self) -> None:
+        self.skeletons.grow(*_MORE_WAYS)
+        if self.descent is not None:
+            self.skeletons.shorten(self.descent, _SHORTENED)
+            below = self.portfolio.worth_drafting(self.to_beat())
+            self.skeletons.shorten_proposed(self.descent, below, _THOROUGH, every=not self.undrafted)
 
     def _cheapest(self) -> float:
         """What the cheapest skeleton promises to cost."""
@@ -159,7 +197,8 @@ class Realisation:
         drafts: list[tuple[float, Draft]] = []
         sketched = 0
         while sketched < _SKETCHED and len(drafts) < _DRAFTS:
-            proposals = list(itertools.islice(self.skeletons.propose(self.to_beat(), _THOROUGH), _AT_ONCE))
+            below = self.portfolio.worth_drafting(self.to_beat())
+            proposals = list(itertools.islice(self.skeletons.propose(below, _THOROUGH), _AT_ONCE))
             if not proposals:
                 break
             for proposal in proposals:
@@ -182,19 +221,21 @@ class Realisation:
         self.skeletons.crowded(proposal, draft.conflict)
         return None
 
-    def _cheapest_insertion(self, proposal: Proposal) -> tuple[float, Timed] | None:
-        """The cheapest of several realisations of a skeleton in space and time, with its cost; None if the first fails.
+    def _cheapest_insertion(self, proposal: Proposal) -> tuple[float, Timed, SpaceTime] | None:
+        """The cheapest of several realisations of a skeleton in space and time, with its cost and schedule; None if the
+        first fails.
 
         They differ by chance, and what starts cheaper usually ends cheaper: far less work than refining all of them.
         Before there is a plan, more than one is tried only where that is quick and the first far dearer than promised.
         """
-        best: tuple[float, Timed] | None = None
+        best: tuple[float, Timed, SpaceTime] | None = None
         for k in range(_INSERTIONS):
             timed = self.growth.insert(proposal, self.skeletons, self.root, varied=k > 0)
-            if timed is not None:
+            schedule = self.growth.insertion.schedule
+            if timed is not None and schedule is not None:
                 cost = plan_cost(*timed, self.growth.problem.cost)
                 if best is None or cost < best[0]:
-                    best = cost, timed
+                    best = cost, timed, schedule
             good = best is not None and best[0] < _POOR * proposal.skeleton.cost
             if best is None or (self._first and (good or len(proposal.stops) > _MANY)):
                 break

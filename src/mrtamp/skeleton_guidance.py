@@ -17,6 +17,7 @@ import numpy as np
 from mrtamp.deadline import Deadline
 from mrtamp.guidance import ModalGuidance
 from mrtamp.modes import Attachment, Mode
+from mrtamp.optimise.descent import Descent, Surroundings
 from mrtamp.plan import Plan
 from mrtamp.problem import HeldBy, Problem, RobotAt
 from mrtamp.roadmap import lazy_path
@@ -40,6 +41,12 @@ _TRIES = 4
 """Calls without result after which a set of ways is grown now and then only."""
 _ROUNDS = 200
 """Lazy searches for the length of one roadmap path."""
+_ADMITTED = 10
+"""Shortened ways that are kept at a time, of different lengths."""
+_SLACK, _UNHURRIED = 0.5, 0.1
+"""Time to spare (rad) from which on a motion hardly counts, and how much it still does."""
+_ALIKE = 0.02
+"""Largest difference of a joint (rad) between ways that are held to be alike."""
 _LIMIT = 12
 _MOST = 120
 """Ways per option that are handed to the search for skeletons."""
@@ -84,6 +91,7 @@ class SkeletonGuidance:
         self.root = root
         self.rng = sampler.rng
         self.ways = Ways(sampler)
+        self._chains: dict[str, tuple[Attachment, ...]] = {}
         self.bound: float | None = None
         self._realised: Counter[tuple] = Counter()
         self._lengths: dict[tuple[str, int, int], tuple[int, float]] = {}
@@ -128,8 +136,124 @@ class SkeletonGuidance:
                 chain = self.ways.settle(self.root, item, chains)
                 if chain is not None:
                     chains[item] = chain
+        self._chains = chains
         for subgoal in self.problem.subgoals:
             self.sampler.reaching.sample(self.root, subgoal, n, keep)
+
+    def shorten(self, descent: Descent, most: int) -> None:
+        """Let up to `most` of the shortest ways of every set with handovers slide along their strata to become shorter.
+
+        A handover has so many dimensions that samples hardly come near a short one; of other ways there are many, and
+        their variety is worth more than that each is as short as it can be.
+
+        Raises
+        ------
+        TimeIsUp : the deadline has passed.
+        """
+        for (item, robots), known in list(self.ways.of.items()):
+            self.deadline.check()
+            if len(robots) < 2:
+                continue
+            fresh = sorted((w for w in known if not w.shortened), key=self.ways.length)[:most]
+            for way in fresh:
+                way.shortened = True
+            if fresh:
+                self._shorten(descent, item, fresh, known)
+
+    def shorten_proposed(self, descent: Descent, below: float, effort: int, *, every: bool) -> None:
+        """The same for the ways of the cheapest skeletons, between what their robots do before and after.
+
+        `every`: also for those without handovers.
+        """
+        groups: dict[tuple[str, tuple[str, ...]], list[tuple[Way, dict[str, Surroundings]]]] = {}
+        for proposal in self.propose(below, effort):
+            for way, around in self._in_context(proposal):
+                gained = way.stops[0].after
+                if gained is not None and (every or len(way.robots) > 1):
+                    groups.setdefault((gained.object, way.robots), []).append((way, around))
+        for (item, robots), found in groups.items():
+            self.deadline.check()
+            around = {
+                r: Surroundings(
+                    *(np.array([getattr(e[r], k) for _, e in found]) for k in ("before", "after", "weight"))
+                )
+                for r in robots
+            }
+            self._shorten(descent, item, [way for way, _ in found], self.ways.of[item, robots], around)
+
+    def _in_context(self, proposal: Proposal) -> Iterator[tuple[Way, dict[str, Surroundings]]]:
+        """The ways of a proposal with what their robots do before and after; what nobody waits for counts less."""
+        ends, slack = self._ends(), self._slack(proposal)
+        for way in {id(way): way for _, way in proposal.stops}.values():
+            around = {}
+            for r in way.robots:
+                course = [k for k, (stop, _) in enumerate(proposal.stops) if r in stop.robots]
+                own = [i for i, k in enumerate(course) if proposal.stops[k][1] is way]
+                start, end = self.problem.robot(r).start, ends[r]
+                first, last = own[0], own[-1] + 1
+                before = proposal.stops[course[first - 1]][0].q[r] if first else start
+                after = proposal.stops[course[last]][0].q[r] if last < len(course) else end
+                motions = [*course[first:last], course[last] if last < len(course) else len(proposal.stops)]
+                weight = [max(_UNHURRIED, 1 - slack[r, k] / _SLACK) for k in motions]
+                around[r] = Surroundings(
+                    before, np.full(len(start), np.nan) if after is None else after, np.array(weight)
+                )
+            yield way, around
+
+    def _slack(self, proposal: Proposal) -> dict[tuple[str, int], float]:
+        """By how much (rad) a robot may be later at a stop, or at the end, before the decoupled schedule takes longer.
+
+        Keys are the robot and the number of the stop; the end has the next number.
+        """
+        stops, n = [stop for stop, _ in proposal.stops], len(proposal.stops)
+        # What has to be over before every stop, and the end, and how long the motion from there takes.
+        waits: list[list[tuple[str | None, int, float]]] = [[(None, j, 0.0) for j in b] for b in proposal.before]
+        waits.append([])
+        last = {r.name: (-1, r.start) for r in self.problem.robots}
+        for k, stop in enumerate(stops):
+            for r in stop.robots:
+                j, q = last[r]
+                waits[k].append((r, j, float(np.linalg.norm(stop.q[r] - q))))
+                last[r] = k, stop.q[r]
+        for r, end in self._ends().items():
+            j, q = last[r]
+            waits[n].append((r, j, 0.0 if end is None else float(np.linalg.norm(end - q))))
+        # The start is number -1, so that it comes last.
+        earliest = np.zeros(n + 2)
+        for k in range(n + 1):
+            earliest[k] = max((earliest[j] + length for _, j, length in waits[k]), default=0.0)
+        latest = np.full(n + 2, earliest[n])
+        for k in reversed(range(n + 1)):
+            for _, j, length in waits[k]:
+                latest[j] = min(latest[j], latest[k] - length)
+        return {
+            (r, k): float(latest[k] - earliest[j] - length)
+            for k in range(n + 1)
+            for r, j, length in waits[k]
+            if r is not None
+        }
+
+    def _shorten(
+        self,
+        descent: Descent,
+        item: str,
+        fresh: list[Way],
+        known: list[Way],
+        around: Mapping[str, Surroundings] | None = None,
+    ) -> None:
+        bases = {body: self.sampler.validity.world_pose(chain) for body, chain in self._chains.items()}
+        lengths, stages = descent.shorten(self.root, fresh, bases, item in self.ways.planned, around)
+        new: list[np.ndarray] = [_flat(w) for w in known if w.shortened]
+        enough = len(new) + _ADMITTED
+        for k in np.argsort(lengths, kind="stable").tolist():
+            flat = np.concatenate([x for q in stages[k][0].q for x in q.values()])
+            if any(np.abs(flat - other).max() < _ALIKE for other in new):
+                continue
+            slid = self.ways.admit(self.root, fresh[k], [(s.q, s.after) for s in stages[k]], self._chains)
+            if slid is not None:
+                new.append(_flat(slid))
+                if len(new) == enough:
+                    return
 
     def _grow_carries(self, item: str, chains: Mapping[str, tuple[Attachment, ...]], n: int, keep: int) -> None:
         for robot in self.robots:
@@ -298,6 +422,13 @@ class SkeletonGuidance:
         way.failures += 1
         way.penalty += _FAILED
 
+    def refused(self, proposal: Proposal) -> set[int]:
+        """The judge objects to realisations of this; the numbers (`id`) of its ways, which seem dearer now."""
+        ways = {id(way): way for _, way in proposal.stops}
+        for way in ways.values():
+            self.failed(way)
+        return set(ways)
+
     def crowded(self, proposal: Proposal, conflict: float) -> None:
         """Robots would collide a lot on these ways; whose ways are to blame is left to chance."""
         for way in {id(way): way for _, way in proposal.stops}.values():
@@ -322,9 +453,11 @@ class SkeletonGuidance:
                         q = {r: segment.q[r][-1].copy() for r in a.robots}
                         stops.append(Stop(a.kind, a.robots, a.before, a.after, q))
             robots = tuple(dict.fromkeys(r for s in stops for r in s.robots))
-            carried = [s.kind for s in stops] == ["pick", "place"] and len(robots) == 1
-            if carried and stops[0].before is self.root.of[item]:
-                self.ways.of.setdefault((item, robots), []).append(Way(tuple(stops)))
+            kinds = [s.kind for s in stops]
+            if (kinds, len(robots)) not in ((["pick", "place"], 1), (["pick", "handover", "place"], 2)):
+                continue
+            if stops[0].before is self.root.of[item]:
+                self.ways.of.setdefault((item, robots), []).append(Way(tuple(stops), shortened=True))
 
     # -- realisation ----------------------------------------------------------------------------------------------
 
@@ -343,6 +476,8 @@ class SkeletonGuidance:
     def _register(self, stop: Stop, mode: Mode) -> Candidate | None:
         sampler = self.sampler
         assert stop.before is not None and stop.after is not None
+        if stop.kind == "handover":
+            return sampler.meet(mode, stop.before, stop.after, stop.q)
         picks = stop.kind == "pick"
         [robot] = stop.robots
         placement, grasp = (stop.before, stop.after) if picks else (stop.after, stop.before)
@@ -354,3 +489,8 @@ class SkeletonGuidance:
         stats.accepted += 1
         pick, place = sampler.register(robot, v, placement, grasp, base)
         return pick if picks else place
+
+
+def _flat(way: Way) -> np.ndarray:
+    """All configurations of a way, one after the other."""
+    return np.concatenate([x for stop in way.stops for x in stop.q.values()])

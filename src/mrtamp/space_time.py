@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mrtamp.check_report import Report
 from mrtamp.collision import RESOLUTION, Collision, bisection_order, load_poses
 from mrtamp.modes import Attachment, Mode
 from mrtamp.plan import Segment
@@ -150,11 +151,16 @@ class Clearances:
         """Whether two robots, with what they hold, keep clear of each other in one step."""
         if one > two:
             one, a, held_a, two, b, held_b = two, b, held_b, one, a, held_a
-        key = (one, a.a, a.b, held_a, two, b.a, b.b, held_b)
+        key = _pair_key(one, a, held_a, two, b, held_b)
         known = self._pairs.get(key)
         if known is None:
             known = self._pairs[key] = self._apart(one, a, held_a, two, b, held_b)
         return known
+
+    def forbid(self, moves: Mapping[str, tuple[Move, Attachment | None]]) -> None:
+        """Two robots, with what they hold, do not keep clear of each other in one step, whatever samples say."""
+        (one, (a, held_a)), (two, (b, held_b)) = sorted(moves.items())
+        self._pairs[_pair_key(one, a, held_a, two, b, held_b)] = False
 
     def _apart(
         self, one: str, a: Move, held_a: Attachment | None, two: str, b: Move, held_b: Attachment | None
@@ -212,6 +218,10 @@ class Clearances:
                 known = world.first_hit(world.rows(q, held, {item: X_WO})) < 0
             self._objects[key] = known
         return known
+
+
+def _pair_key(one: str, a: Move, held_a: Attachment | None, two: str, b: Move, held_b: Attachment | None) -> tuple:
+    return (one, a.a, a.b, held_a, two, b.a, b.b, held_b)
 
 
 class SpaceTime:
@@ -407,6 +417,21 @@ class SpaceTime:
             return True
         finally:
             self.events.pop()
+
+    def forbid(self, report: Report) -> bool:
+        """Learn where the judge found two robots in each other's way; whether there was such a step."""
+        bounds = [0, *self.events]
+        learnt = False
+        for v in report.violations:
+            if v.kind != "collision" or v.segment is None or v.step is None:
+                continue
+            t = bounds[v.segment] + v.step
+            holders = {a.object: r for r in self.names if (a := self._holds(r, t)) is not None}
+            robots = {holders.get(s.owner, s.owner) for s in v.sides or ()} & set(self.names)
+            if len(robots) == 2:
+                self.clearances.forbid({r: (self._move(r, t), self._holds(r, t)) for r in robots})
+                learnt = True
+        return learnt
 
     def segments(self) -> list[Segment]:
         """The schedule as segments, one per mode."""

@@ -126,6 +126,6 @@ def test_sets_of_ways_keep_growing_up_to_their_limit_and_keep_the_short_ones() -
         planner.skeletons.grow(80, 30)
         [known] = planner.skeletons.ways.of.values()
         sizes.append(len(known))
-        shortest.append(min(planner.skeletons.ways._length(w) for w in known))
+        shortest.append(min(planner.skeletons.ways.length(w) for w in known))
     assert sizes[-1] > 60 and max(sizes) <= 160
     assert shortest == sorted(shortest, reverse=True)

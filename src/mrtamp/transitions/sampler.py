@@ -225,15 +225,16 @@ class TransitionSampler(Workspace):
         qb = found[np.arange(len(qa)), np.argmax(each[:, :, 0], axis=1)]
         return self._exchanges(mode, giver, receiver, grasps, qa, qb, solved, keep, directly=directly)
 
-    def vary_handover(
-        self, mode: Mode, giver: str, receiver: str, taken: Attachment, qa: np.ndarray, qb: np.ndarray, keep: int = 3
-    ) -> list[Candidate]:
-        """Handovers into a known grasp with the giver at qa (N, n) and the receiver near qb (N, m); the new ones."""
+    def meet(self, mode: Mode, given: Attachment, taken: Attachment, q: Mapping[str, np.ndarray]) -> Candidate | None:
+        """The handover from one grasp into another at configurations q; None where it collides."""
+        giver, receiver = given.parent, taken.parent
         stats = self.outcome(("handover", (giver, receiver), taken.object, giver))
-        stats.calls += 1
-        grasps = [taken] * len(qa)
-        q, solved = self.ik(receiver, self._received(giver, mode.held[giver], qa, grasps), qb)
-        return self._exchanges(mode, giver, receiver, grasps, qa, q, solved, keep, directly=True)
+        at = self.contacts.exchange(mode, giver, receiver, given, taken, q[giver], q[receiver], stats)
+        if at is None:
+            return None
+        candidate = Candidate("handover", (giver, receiver), at, given, taken)
+        self._handovers.setdefault((given, receiver), []).append(candidate)
+        return candidate
 
     def _received(self, giver: str, grasp: Attachment, qa: np.ndarray, grasps: Sequence[Attachment]) -> np.ndarray:
         """Poses X_WG (N, 4, 4) of the receiver's hand for each of its grasps, with the giver at qa (N, n)."""

@@ -7,7 +7,7 @@ costs chooses among many of them, and only the chosen ones become roadmap vertic
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -24,10 +24,6 @@ _PLACES = 3
 """Places drawn per grasp."""
 _AFTER = 24
 """Places drawn after a handover: those are dear, so each is followed up."""
-_BEST, _VARIED = 10, 5
-"""Of the shortest ways with a handover so many, drawn at random, are varied each time more are sampled."""
-_INWARD, _SPREAD = 0.6, 0.2
-"""Variations of a handover lie up to that share of the way nearer to its robots' other stops, give or take (rad)."""
 _CHECKED = 0.6
 """Share of the solved ways, shortest first for the most part, that are checked for collisions."""
 BLOCKED = 1.5
@@ -54,11 +50,20 @@ class Stop:
 
 @dataclass(eq=False)
 class Way:
-    """A chain of stops.  `penalty` is what experience adds to its estimated cost (rad)."""
+    """A chain of stops.  `penalty` is what experience adds to its estimated cost (rad).
+
+    `shortened` : whether it has been made shorter, or was found to be no longer than it has to be.
+    """
 
     stops: tuple[Stop, ...]
     penalty: float = 0.0
     failures: int = field(default=0)
+    shortened: bool = False
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Who takes part, in the order in which they do."""
+        return tuple(dict.fromkeys(r for stop in self.stops for r in stop.robots))
 
 
 class _Place(NamedTuple):
@@ -90,7 +95,7 @@ class Ways:
         self.rng = sampler.rng
         self.of: dict[tuple[str, tuple[str, ...]], list[Way]] = {}
         self.tries: dict[tuple[str, tuple[str, ...]], int] = {}
-        self._planned: dict[str, Attachment] = {}
+        self.planned: dict[str, Attachment] = {}
 
     # -- where things will be -------------------------------------------------------------------------------------
 
@@ -101,7 +106,7 @@ class Ways:
 
         `chains` holds those of the objects below it.
         """
-        planned = self._planned.get(item)
+        planned = self.planned.get(item)
         if planned is None:
             return None
         return (planned, *(chains.get(planned.parent, mode.chain(planned.parent)) if planned.parent in mode.of else ()))
@@ -112,17 +117,18 @@ class Ways:
         Ways that put it elsewhere are dropped: the others are solved for this very placement.
         """
         ways = [w for (name, _), known in self.of.items() if name == item for w in known]
-        if item in self._planned or not ways:
+        if item in self.planned or not ways:
             return False
-        planned = min(ways, key=self._length).stops[-1].after
+        planned = min(ways, key=self.length).stops[-1].after
         assert planned is not None
-        self._planned[item] = planned
+        self.planned[item] = planned
         for key, known in self.of.items():
             if key[0] == item:
                 self.of[key] = [w for w in known if w.stops[-1].after is planned]
         return True
 
-    def _length(self, way: Way) -> float:
+    def length(self, way: Way) -> float:
+        """What the robots of a way travel from home and back (rad), and its penalty."""
         length, last = way.penalty, {r: self._home(r) for s in way.stops for r in s.robots}
         for stop in way.stops:
             for r, q in stop.q.items():
@@ -210,39 +216,13 @@ class Ways:
         for pick in [picks[int(i)] for i in self.rng.permutation(len(picks))[:2]]:
             held = mode.replace(*([pick.after] if pick.after else []))
             handovers = sampler.sample_handover(held, giver, receiver, n, directly=True)
-            out += self._followed_up(mode, pick, handovers, places)
+            out += self._followed_up(mode, stop_of(pick, sampler), handovers, places)
             if len(out) >= keep:
                 break
-        if self.tries[key] > 1:
-            shortest: dict[tuple[Attachment | None, ...], Way] = {}
-            for way in sorted(self.of.get(key, ()), key=self._length):
-                shortest.setdefault(tuple(stop.after for stop in way.stops[:2]), way)
-            best = [*shortest.values()][:_BEST]
-            for way in [best[int(i)] for i in self.rng.permutation(len(best))[:_VARIED]]:
-                out += self._varied(mode, way, n, places)
         self._keep(key, out)
         return out
 
-    def _varied(self, mode: Mode, way: Way, n: int, places: list[_Place]) -> list[Way]:
-        """Ways with the grasps of a given one whose handovers lie nearer to where their robots come from and go to.
-
-        A handover has so many dimensions that uniform samples alone hardly come near a short one.
-        """
-        pick, handover, place = way.stops
-        giver, receiver = handover.robots
-        assert pick.candidate is not None and pick.after is not None and handover.after is not None
-        near = []
-        for r, other in ((giver, pick.q[giver]), (receiver, place.q[receiver])):
-            q, chain = handover.q[r], self.sampler.roadmaps[r].world.chain
-            inward = self.rng.uniform(0, _INWARD, (n, 1)) * ((self._home(r) + other) / 2 - q)
-            near.append(
-                np.clip(q + inward + self.rng.normal(scale=_SPREAD, size=(n, len(q))), chain.lower, chain.upper)
-            )
-        held = mode.replace(pick.after)
-        found = self.sampler.vary_handover(held, giver, receiver, handover.after, near[0], near[1])
-        return self._followed_up(mode, pick.candidate, found, places)
-
-    def _followed_up(self, mode: Mode, pick: Candidate, handovers: list[Candidate], places: list[_Place]) -> list[Way]:
+    def _followed_up(self, mode: Mode, pick: Stop, handovers: list[Candidate], places: list[_Place]) -> list[Way]:
         """Ways from a pick through each of the handovers to up to two places."""
         sampler = self.sampler
         out: list[Way] = []
@@ -264,18 +244,68 @@ class Ways:
                 if not np.isfinite(penalty):
                     continue
                 place = Stop("place", (receiver,), taken, after, {receiver: q2[k]})
-                out.append(Way((stop_of(pick, sampler), stop_of(handover, sampler), place), BLOCKED * penalty))
+                out.append(Way((pick, stop_of(handover, sampler), place), BLOCKED * penalty))
                 found += 1
                 if found == 2:
                     break
         return out
+
+    def admit(
+        self,
+        mode: Mode,
+        way: Way,
+        stages: Sequence[tuple[Sequence[Mapping[str, np.ndarray]], Sequence[Attachment]]],
+        chains: Mapping[str, tuple[Attachment, ...]],
+    ) -> Way | None:
+        """A way made from another by sliding its stops along their strata; None where none of them is free to be used.
+
+        `stages` are such ways, the best first: for every stop the configurations of its robots, and what is attached
+        after it.  The first one free of collision is kept.
+        """
+        item = way.stops[0].after
+        assert item is not None
+        for q, after in stages:
+            found = self._slid(mode, way, q, after, chains)
+            if found is not None:
+                self.of.setdefault((item.object, way.robots), []).append(found)
+                return found
+        return None
+
+    def _slid(
+        self,
+        mode: Mode,
+        way: Way,
+        q: Sequence[Mapping[str, np.ndarray]],
+        after: Sequence[Attachment],
+        chains: Mapping[str, tuple[Attachment, ...]],
+    ) -> Way | None:
+        sampler = self.sampler
+        first, last = way.stops[0].robots[0], way.stops[-1].robots[-1]
+        placement, grasp = after[-1], after[-2]
+        base = chains.get(placement.parent, ())
+        penalty = self._picks_free(mode, first, [after[0]], q[0][first][None])[0]
+        penalty += self._place_free(mode, last, grasp, placement, base, q[-1][last])
+        if not np.isfinite(penalty):
+            return None
+        before = [way.stops[0].before, *after[:-1]]
+        stops = []
+        for k, stop in enumerate(way.stops):
+            candidate = None
+            if stop.kind == "handover":
+                given = before[k]
+                assert given is not None
+                candidate = sampler.meet(mode, given, after[k], q[k])
+                if candidate is None:
+                    return None
+            stops.append(Stop(stop.kind, stop.robots, before[k], after[k], q[k], candidate))
+        return Way(tuple(stops), BLOCKED * penalty, shortened=True)
 
     def _keep(self, key: tuple[str, tuple[str, ...]], ways: list[Way], most: int = 160) -> None:
         """Add ways to a set; the longest go when it grows too large, a random part of it is spared."""
         known = self.of.setdefault(key, [])
         known += ways
         if len(known) > most:
-            order = np.argsort([self._length(w) for w in known], kind="stable")
+            order = np.argsort([self.length(w) for w in known], kind="stable")
             lucky = self.rng.choice(order[most // 2 :], size=most // 4, replace=False)
             chosen = {*order[: most // 2].tolist(), *lucky.tolist()}
             self.of[key] = [w for i, w in enumerate(known) if i in chosen]
@@ -293,7 +323,7 @@ class Ways:
                     continue
                 chain = chains[support.body]
             X_WB = sampler.validity.world_pose(chain) if chain else sampler.validity.X_WB[support.body]
-            planned = self._planned.get(item)
+            planned = self.planned.get(item)
             if planned is not None and planned.support == support.name:
                 # Others count on this very placement.
                 out.append(_Place(support, chain, FixedFamily(support.name, planned.X_PO), X_WB, planned))

@@ -14,7 +14,7 @@ from mrtamp.roadmap import Roadmap
 from mrtamp.transitions.candidate import Outcome, StratumKey
 from mrtamp.transitions.families import FixedFamily, GraspFamily, grasp_families, placement_families
 from mrtamp.transitions.holds import Holds
-from mrtamp.transitions.projection import mixed_seeds, solve_ik
+from mrtamp.transitions.projection import ITERATIONS, mixed_seeds, solve_ik
 from mrtamp.transitions.reachability import ReachabilityMap
 from mrtamp.validity import Validity
 
@@ -115,8 +115,11 @@ class Workspace:
         out[mapped] = self.maps[robot].seeds(X_WG[mapped], self.rng)
         return out + self.rng.normal(scale=0.3, size=q.shape)
 
-    def ik(self, robot: str, X_WG: np.ndarray, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        q, solved = solve_ik(self.roadmaps[robot].world.tool, X_WG[:, :3, :3], X_WG[:, :3, 3], seeds)
+    def ik(
+        self, robot: str, X_WG: np.ndarray, seeds: np.ndarray, iterations: int = ITERATIONS
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Configurations (N, n) for hand poses (N, 4, 4), and which are solved; see `solve_ik`."""
+        q, solved = solve_ik(self.roadmaps[robot].world.tool, X_WG[:, :3, :3], X_WG[:, :3, 3], seeds, iterations)
         self.collision.counts.ik_attempts += len(q)
         self.collision.counts.ik_successes += int(solved.sum())
         return q, solved
