@@ -8,7 +8,7 @@ import pytest
 from mrtamp.collision import Collision
 from mrtamp.modes import Attachment, Mode, start_mode
 from mrtamp.optimise.choices import Choices
-from mrtamp.optimise.nearness import Near, Nearness, Samples
+from mrtamp.optimise.nearness import Near, Nearness, Samples, closest_points
 from mrtamp.problem import Problem
 from mrtamp.problem_file import load_problem, problem_from_dict
 from mrtamp.problem_writer import problem_to_dict
@@ -103,3 +103,40 @@ def test_robots_and_what_they_hold_against_the_world_and_each_other(problem: Pro
     assert sum(map(len, theirs)) > 20
     matches += [agree(a, b) for a, b in zip(ours, theirs, strict=True)]
     assert np.mean(matches) > 0.98
+
+
+class Flaky:
+    """A query whose search for distances fails: for all pairs at once, and for one of them alone."""
+
+    def __init__(self, query, fails: tuple) -> None:
+        self.query = query
+        self.fails = fails
+
+    def inspector(self):
+        return self.query.inspector()
+
+    def ComputeSignedDistancePairwiseClosestPoints(self, reach: float):
+        raise RuntimeError("maximum number of iterations")
+
+    def ComputeSignedDistancePairClosestPoints(self, a, b):
+        if {a, b} == set(self.fails):
+            raise RuntimeError("maximum number of iterations")
+        return self.query.ComputeSignedDistancePairClosestPoints(a, b)
+
+
+def test_where_drake_finds_no_distance_the_other_pairs_are_measured_all_the_same() -> None:
+    problem = load_problem("pick_place", robots=2, objects=2)
+    world = next(iter(Collision(problem).worlds.values()))
+    scene = world.scene
+    row = world.rows(world.home[None], None, {})[0]
+    scene.plant.SetPositions(world.context, row)
+    query = scene.plant.get_geometry_query_input_port().Eval(world.context)
+    every = {g for pair in query.inspector().GetCollisionCandidates() for g in pair}
+    reach = 0.2
+    whole = {(p.id_A, p.id_B): p.distance for p in closest_points(query, reach, every)}
+    assert len(whole) > 1
+    lost, *_ = whole
+    found = {(p.id_A, p.id_B): p.distance for p in closest_points(Flaky(query, lost), reach, every)}
+    assert found.keys() == whole.keys() - {lost}
+    assert all(abs(found[pair] - whole[pair]) < 1e-6 for pair in found)
+    assert not closest_points(Flaky(query, lost), reach, set()), "only pairs of those that were asked for"

@@ -3,7 +3,8 @@
 Samples alone hardly come near a short way: a pick, a handover and a place have some thirty dimensions together.  Each
 step of the descent is one small quadratic program per way, all solved in one batch: the squares of the motions, weighed
 so that their sum falls as that of their lengths does, subject to h_A = 0 linearised, with grasps and placements as
-coordinates, bounds, and clearance between two robots that meet.  Afterwards IK puts every stop exactly on its stratum.
+coordinates, bounds, and clearance between two robots that meet.  After each step IK puts every stop back onto its
+stratum, and a step after which a way is no shorter is taken back and tried again shorter.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ _ACTIVE = 3
 """Rounds in which bounds and clearances that a step would violate are added to its program."""
 _SHORT = 0.05
 """Motions (rad) shorter than this are weighed as if they were that long."""
-_DAMPING = 0.1
-_PER_METRE = 16.0
-"""Damping of coordinates in metres, relative to those in rad."""
+_DAMPING, _COORDINATES = 0.1, 16.0
+"""Damping of the programs, and that of grasps and placements relative to that of joints."""
 _CLEARANCE, _REACH = 2e-3, 0.05
 """Clearance (m) between robots that meet, and distance within which they are looked at."""
 _STIFF = 1e6
 """Weight of what is at a bound or too close."""
 _ON_FAMILY = 1e-5
+"""Largest residual (rad, m) of an attachment that belongs to a family."""
 _STEP = 1e-6
 
 
@@ -264,7 +265,7 @@ class _Programs:
             parts.append(c.start)
             lower.append(c.lower)
             upper.append(c.upper)
-            damping.append(np.full(c.start.shape[1], _DAMPING * _PER_METRE))
+            damping.append(np.full(c.start.shape[1], _DAMPING * _COORDINATES))
         self.start = np.concatenate(parts, axis=1)
         self.lower, self.upper = np.concatenate(lower, axis=1), np.concatenate(upper, axis=1)
         self.damping = np.concatenate(damping)

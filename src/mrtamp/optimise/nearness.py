@@ -7,11 +7,13 @@ the wrench W = (p x n, n) and the spatial velocities V = (omega, v at the world'
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from pydrake.geometry import GeometryId, QueryObject, SignedDistancePair
 from pydrake.systems.framework import Context
 
 from mrtamp.collision import Collision
@@ -146,8 +148,7 @@ def _ask(scene: Scene, context: Context, known: _Plant, rows: np.ndarray, reach:
                     carrier[p.id_B],
                     grown.get(p.id_A, 0.0) + grown.get(p.id_B, 0.0),
                 )
-                for p in query.ComputeSignedDistancePairwiseClosestPoints(reach)
-                if p.id_A in foreign or p.id_B in foreign
+                for p in closest_points(query, reach, foreign)
             ]
             last = row
         for d, n, p, x, y, extra in found:
@@ -162,6 +163,23 @@ def _ask(scene: Scene, context: Context, known: _Plant, rows: np.ndarray, reach:
     wrench = np.concatenate([cross(p, n), n], axis=1)
     i, j, k = (np.array(x, dtype=int) for x in (sample, a, b))
     return Near(i, np.array(distance), wrench, j, k, np.array(padding))
+
+
+def closest_points(query: QueryObject, reach: float, of: Set[GeometryId]) -> list[SignedDistancePair]:
+    """Drake's nearest points of all pairs within `reach` (m) one of which is among `of`.
+
+    Drake's search for a distance does not always converge.  It then says nothing about any pair, and each is asked for
+    alone; those about which there is nothing to learn are left out.
+    """
+    try:
+        found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
+    except RuntimeError:
+        found = []
+        for a, b in query.inspector().GetCollisionCandidates():
+            if a in of or b in of:
+                with suppress(RuntimeError):
+                    found.append(query.ComputeSignedDistancePairClosestPoints(a, b))
+    return [p for p in found if (p.id_A in of or p.id_B in of) and p.distance <= reach]
 
 
 @dataclass(frozen=True, eq=False)
