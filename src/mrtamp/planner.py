@@ -217,8 +217,8 @@ class Planner:
                     gain = max(expected - self._cost(), 0.0)
                     self._effort.record(activity, work, gain)
                     if activity == "refinement" and self.portfolio.drafted:
-                        # Without the draft there would be nothing to refine.
-                        self._effort.record("skeletons", 0.0, gain)
+                        # Without the draft there would be nothing to refine: half of the gain is theirs.
+                        self._effort.record("skeletons", 0.0, gain / 2)
                 else:
                     self._tried[activity] += work
                 self._spent = self._elapsed()

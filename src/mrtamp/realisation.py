@@ -185,7 +185,7 @@ class Realisation:
         return self.incumbent.best is None
 
     def _draft(self) -> bool:
-        """Two times out of three, put some cheap skeletons under refinement as they are; whether there was a new one.
+        """Two times out of three, put some cheap skeletons under refinement as they are; whether that was all.
 
         Each robot goes its way as if it were alone, and only the timing makes them yield to one another.  Where that
         leaves little conflict, convex programs pull them apart at hardly more than the skeleton promised.
@@ -200,6 +200,9 @@ class Realisation:
             below = self.portfolio.worth_drafting(self.to_beat())
             proposals = list(itertools.islice(self.skeletons.propose(below, _THOROUGH), _AT_ONCE))
             if not proposals:
+                if not sketched:
+                    # Nothing promises a gain, however it were realised.
+                    return True
                 break
             for proposal in proposals:
                 sketched += 1
