@@ -4,7 +4,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-BUDGET ?= 5
+BUDGET ?= 10
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test lint format notebooks venv clean
