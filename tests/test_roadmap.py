@@ -13,7 +13,7 @@ from arena import arena
 
 from mrtamp.collision import RESOLUTION, Collision, Counts, RobotWorld
 from mrtamp.problem import MovableObject, Problem, Robot, Shape, StaticBody
-from mrtamp.roadmap import Roadmap, add_stations, lazy_path, prm_star_neighbours, roadmaps_of
+from mrtamp.roadmap import Roadmap, ShortestPaths, add_stations, lazy_path, prm_star_neighbours, roadmaps_of
 from mrtamp.robot_file import load_robot_model
 from mrtamp.scene import RigidTransform
 
@@ -145,6 +145,47 @@ def test_new_vertices_are_joined_to_their_nearest_as_prm_star_asks(world: RobotW
         nearest = np.argsort(np.linalg.norm(roadmap.q[:n] - q, axis=1))[:k]
         assert set(roadmap.neighbours(v)) == set(nearest.tolist())
     assert prm_star_neighbours(10**6, 7) < 3 * prm_star_neighbours(10**3, 7), "with the logarithm"
+
+
+def test_vertices_added_at_once_are_joined_as_one_after_another(world: RobotWorld) -> None:
+    rng = np.random.default_rng(6)
+    at_once, in_turn = Roadmap(world), Roadmap(world)
+    for size in (1, 5, 60, 0, 2, 130):
+        q = rng.uniform(world.chain.lower, world.chain.upper, size=(size, 7))
+        # What is not open is nobody's neighbour.
+        for roadmap in (at_once, in_turn):
+            roadmap.add_vertex(q[0] if size else world.home, connect=False)
+        at_once.add_vertices(q)
+        for x in q:
+            in_turn.add_vertex(x)
+    np.testing.assert_array_equal(at_once.q, in_turn.q)
+    np.testing.assert_array_equal(at_once.ends, in_turn.ends)
+    np.testing.assert_allclose(at_once.w, in_turn.w, rtol=1e-12)
+    assert at_once.open_vertices() == in_turn.open_vertices()
+
+
+@pytest.mark.parametrize("expansions", [0, 3, 10_000])
+def test_paths_stay_shortest_while_more_edges_are_blocked(
+    roadmap: Roadmap, monkeypatch: pytest.MonkeyPatch, expansions: int
+) -> None:
+    """Whether A* may hardly look around or need never compute distances anew."""
+    monkeypatch.setattr("mrtamp.roadmap._EXPANSIONS", expansions)
+    rng = np.random.default_rng(7)
+    for start, goal in ((0, 100), (40, 7)):
+        blocked = rng.random(roadmap.n_edges) < 0.2
+        search, found = ShortestPaths(roadmap, start, goal, blocked), 0
+        while True:
+            path = search.path()
+            graph = as_graph(roadmap, blocked)
+            if path is None:
+                assert not nx.has_path(graph, start, goal)
+                break
+            found += 1
+            assert length(roadmap, path) == pytest.approx(nx.dijkstra_path_length(graph, start, goal))
+            edges = [roadmap.edge(a, b) for a, b in pairwise(path)]
+            assert not blocked[edges].any()
+            blocked[edges[int(rng.integers(len(edges)))]] = True
+        assert found > 10
 
 
 def test_searches_between_which_the_roadmap_grows_are_dijkstras(world: RobotWorld) -> None:

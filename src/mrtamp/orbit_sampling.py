@@ -78,8 +78,7 @@ class OrbitSampling:
         known = roadmap.q[self.rng.integers(roadmap.n_vertices, size=n)]
         near = np.clip(known + self.rng.normal(scale=0.4, size=q.shape), world.chain.lower, world.chain.upper)
         q = np.where(self.rng.random(n)[:, None] < 0.5, q, near)
-        for x in q[~world.hits(world.rows(q, None, {}))]:
-            roadmap.add_vertex(x)
+        roadmap.add_vertices(q[~world.hits(world.rows(q, None, {}))])
 
     def sample_transitions(self, mode: Mode, choices: list[Choice], *, improving: bool) -> list[Combination]:
         """Candidates for every choice, known and new, combined into simultaneous transitions; none if one has none.

@@ -7,6 +7,7 @@ chain.
 
 from __future__ import annotations
 
+import heapq
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from mrtamp.collision import RESOLUTION, Collision, RobotWorld
 from mrtamp.problem import Problem, RobotAt
@@ -23,6 +26,12 @@ _HAND = 0.1
 """Distance (m) from the tool frame that is tracked along edges where nothing larger is carried."""
 _KEPT_SPHERES = 20_000
 """Edges per robot whose bounding spheres are kept (some 8 kB each): old ones are computed again when asked for."""
+_LEAST_LENGTH = 1e-9
+"""What searches take an edge to be at least as long as (rad): sparse matrices have no edges of length zero."""
+_ROUNDING = 1e-12
+"""Difference of lengths (rad) that is none."""
+_EXPANSIONS, _DIJKSTRA = 10, 40
+"""Vertices that A* may expand, and in proportion to how many one more: then Dijkstra's algorithm is quicker."""
 
 
 class Roadmap:
@@ -86,6 +95,21 @@ class Roadmap:
             self._open_up(i)
         return i
 
+    def add_vertices(self, q: np.ndarray) -> None:
+        """Add configurations (m, n) one after another, each joined as by `add_vertex`, in far less time."""
+        before = len(self._open)
+        if len(q) < 2 or not before:
+            for x in q:
+                self.add_vertex(x)
+            return
+        most = min(before, prm_star_neighbours(before + len(q), self.n_dof))
+        far, old = cKDTree(self._open_q[:before]).query(q, k=np.arange(1, most + 1))
+        among = cdist(q, q)
+        for m, x in enumerate(q):
+            i = self.add_vertex(x, connect=False)
+            self._join(i, np.concatenate([old[m], np.arange(before, before + m)]), np.append(far[m], among[m, :m]))
+            self._open_up(i)
+
     def _open_up(self, i: int) -> None:
         n = len(self._open)
         if n == len(self._open_q):
@@ -95,27 +119,31 @@ class Roadmap:
 
     def _connect(self, i: int) -> None:
         n = len(self._open)
-        if not n:
-            return
-        distance = np.linalg.norm(self._open_q[:n] - self._q[i], axis=1)
-        k = prm_star_neighbours(n, self.n_dof)
-        nearest = np.argpartition(distance, k)[:k] if k < n else np.arange(n)
-        for j in nearest[np.argsort(distance[nearest], kind="stable")]:
-            self.edge(i, self._open[j])
+        if n:
+            self._join(i, np.arange(n), np.linalg.norm(self._open_q[:n] - self._q[i], axis=1))
+
+    def _join(self, i: int, others: np.ndarray, distance: np.ndarray) -> None:
+        """Edges to the nearest of some open vertices (by their number among these), of which all nearest ones are."""
+        k = prm_star_neighbours(len(self._open), self.n_dof)
+        nearest = np.argpartition(distance, k)[:k] if k < len(distance) else np.arange(len(distance))
+        nearest = nearest[np.argsort(distance[nearest], kind="stable")]
+        for j, d in zip(others[nearest].tolist(), distance[nearest].tolist(), strict=True):
+            self._add_edge(self._open[j], i, d)
 
     def edge(self, a: int, b: int) -> int:
         """The edge between two vertices, made if need be; (a, a) is the degenerate edge of standing at a."""
         key = (a, b) if a <= b else (b, a)
         known = self._edge_of.get(key)
-        if known is not None:
-            return known
+        return self._add_edge(*key, float(np.linalg.norm(self._q[a] - self._q[b]))) if known is None else known
+
+    def _add_edge(self, a: int, b: int, length: float) -> int:
+        """A new edge, a <= b."""
         if self.n_edges == len(self._w):
             self._ends = np.concatenate([self._ends, np.empty_like(self._ends)])
             self._w = np.concatenate([self._w, np.empty_like(self._w)])
         e = self.n_edges
-        self._ends[e] = key
-        self._w[e] = np.linalg.norm(self._q[a] - self._q[b])
-        self._edge_of[key] = e
+        self._ends[e, 0], self._ends[e, 1], self._w[e] = a, b, length
+        self._edge_of[a, b] = e
         self.n_edges += 1
         if a != b:
             self._adjacent[a].append(b)
@@ -176,16 +204,11 @@ class Roadmap:
 
         `blocked` may be shorter than E: edges younger than it are not blocked.
         """
-        if start == goal:
-            return [start]
-        graph = self._arcs.weighted(self.ends, self.w, self.n_vertices, blocked)
-        distance, parent = dijkstra(graph, indices=start, return_predecessors=True)
-        if not np.isfinite(distance[goal]):
-            return None
-        path = [goal]
-        while path[-1] != start:
-            path.append(int(parent[path[-1]]))
-        return path[::-1]
+        return ShortestPaths(self, start, goal, blocked).path()
+
+    def arcs(self, v: int) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices that share an edge with `v`, and the numbers of these edges."""
+        return self._arcs.row(v, self.ends, self.n_vertices)
 
     def distances_to(self, target: int, blocked: np.ndarray | None = None) -> np.ndarray:
         """Lengths (V,), rad, of the shortest paths from every vertex to `target` that avoid `blocked` (E,) edges."""
@@ -246,11 +269,18 @@ class _Arcs:
         if self._stale or n_vertices > len(self._used):
             self._lay_out(ends, n_vertices)
         weight = np.full(len(w) + 1, np.inf)
-        np.maximum(w, 1e-9, out=weight[:-1])
+        np.maximum(w, _LEAST_LENGTH, out=weight[:-1])
         if blocked is not None:
             weight[: len(blocked)][blocked] = np.inf
         n = len(self._used)
         return csr_array((weight[self._edge], self._target, self._start), shape=(n, n))
+
+    def row(self, v: int, ends: np.ndarray, n_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+        """Where the edges (E, 2) lead from vertex v, and their numbers."""
+        if self._stale or v >= len(self._used):
+            self._lay_out(ends, n_vertices)
+        places = slice(self._start[v], self._start[v] + self._used[v])
+        return self._target[places], self._edge[places]
 
     def _lay_out(self, ends: np.ndarray, n_vertices: int) -> None:
         rows = n_vertices + n_vertices // 4 + 16
@@ -268,6 +298,75 @@ class _Arcs:
         place = np.repeat(self._start[:-1] - first, self._used) + np.arange(len(order))
         self._target[place], self._edge[place] = target[order], edge[order]
         self._stale = False
+
+
+class ShortestPaths:
+    """Shortest paths between two vertices, asked for again and again while ever more edges are blocked.
+
+    Distances to the goal that were computed with fewer edges blocked are lower bounds: A* with them hardly looks beside
+    the path that it returns.  Where it does they are computed anew (lazy search: Dellin and Srinivasa, 2016).
+
+    Parameters
+    ----------
+    blocked : (E,) marks edges to be avoided, and may change in place, from False to True only; edges younger than it
+        are not blocked.
+    """
+
+    def __init__(self, roadmap: Roadmap, start: int, goal: int, blocked: np.ndarray) -> None:
+        self._roadmap = roadmap
+        self._start, self._goal = start, goal
+        self._blocked = blocked
+        self._look()
+
+    def _look(self) -> None:
+        self._to_go = self._roadmap.distances_to(self._goal, self._blocked)
+        self._edges = self._roadmap.n_edges
+
+    def path(self) -> list[int] | None:
+        """Vertices of a shortest path, None where there is none."""
+        if self._edges != self._roadmap.n_edges:
+            self._look()
+        if not np.isfinite(self._to_go[self._start]):
+            return None
+        found = self._search(_EXPANSIONS + self._roadmap.n_vertices // _DIJKSTRA)
+        if found is None:
+            self._look()
+            # With the distances as they are now A* goes straight to the goal.
+            found = self._search(np.inf) if np.isfinite(self._to_go[self._start]) else None
+        return found
+
+    def _search(self, most: float) -> list[int] | None:
+        """A*; None where it would have to expand more vertices than that, or comes to an end without a path."""
+        start, goal, to_go, w = self._start, self._goal, self._to_go, self._roadmap.w
+        came = np.full(len(to_go), np.inf)
+        parent = np.full(len(to_go), start)
+        came[start] = 0.0
+        queue = [(float(to_go[start]), start, 0.0)]
+        while queue and most > 0:
+            _, v, so_far = heapq.heappop(queue)
+            if v == goal:
+                path = [v]
+                while path[-1] != start:
+                    path.append(int(parent[path[-1]]))
+                return path[::-1]
+            if so_far > came[v]:
+                continue
+            most -= 1
+            targets, edges = self._roadmap.arcs(v)
+            cost = so_far + np.maximum(w[edges], _LEAST_LENGTH)
+            total = cost + to_go[targets]
+            better = (cost < came[targets] - _ROUNDING) & (total < np.inf) & self._free(edges)
+            targets, cost, total = targets[better], cost[better], total[better]
+            came[targets], parent[targets] = cost, v
+            for entry in zip(total.tolist(), targets.tolist(), cost.tolist(), strict=True):
+                heapq.heappush(queue, entry)
+        return None
+
+    def _free(self, edges: np.ndarray) -> np.ndarray:
+        known = len(self._blocked)
+        if self._roadmap.n_edges <= known:
+            return ~self._blocked[edges]
+        return (edges >= known) | ~self._blocked[np.minimum(edges, known - 1)]
 
 
 def prm_star_neighbours(n: int, dof: int) -> int:
@@ -299,8 +398,9 @@ def lazy_path(
 
     `blocked` marks edges known to be invalid and is updated in place.  None after `rounds` searches without success.
     """
+    search = ShortestPaths(roadmap, start, goal, blocked)
     for _ in range(rounds):
-        path = roadmap.shortest(start, goal, blocked)
+        path = search.path()
         if path is None:
             return None
         edges = [roadmap.edge(a, b) for a, b in itertools.pairwise(path)]

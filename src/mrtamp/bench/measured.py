@@ -76,12 +76,14 @@ def run_on_worker(assignment: Assignment) -> Record:
 def plan_assignment(assignment: Assignment, tell: Tell) -> Record:
     """Plan once, in this process, and have the plans judged; how long it took to get here is seen from outside."""
     from mrtamp.plan import measures
-    from mrtamp.planners import make_planner
+    from mrtamp.planners import make_planner, planner_options
 
     entrant, limit_s = assignment.entrant, assignment.case.limit_s
     problem = assignment.case.task(assignment.layout).load()
-    # What is loaded with the first use of the judge belongs to the start.
+    # What is loaded with the first use of a planner or of the judge belongs to the start.
     import mrtamp.check  # noqa: F401
+
+    options = planner_options(entrant.planner, entrant.options())
 
     tell(_PLANNING)
     plans: list[Plan] = []
@@ -89,7 +91,7 @@ def plan_assignment(assignment: Assignment, tell: Tell) -> Record:
     first_counts: dict[str, int] = {}
     started = time.perf_counter()
     with Pulse(tell) as pulse:
-        planner = make_planner(entrant.planner, problem, assignment.seed, entrant.options())
+        planner = make_planner(entrant.planner, problem, assignment.seed, options)
         for plan in planner.improve(max(limit_s - (time.perf_counter() - started), 0.0)):
             points.append(Point(time.perf_counter() - started, plan.cost, **measures(plan.segments)))
             first_counts = first_counts or dict(planner.counts())
