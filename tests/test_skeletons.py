@@ -297,3 +297,17 @@ def test_it_is_fast(robots: int, tasks: int, seconds: float) -> None:
     found = skeletons(every, [], starts, ends, CostWeights(), limit=10, rng=rng)
     assert time.process_time() - clock < seconds
     assert len(found) == 10
+
+
+def test_other_candidates_of_an_order_are_clearly_different_ones_as_long_as_there_are() -> None:
+    """Ten all but equal candidates at each of three places, near, farther and far away."""
+    rng = np.random.default_rng(0)
+    q = np.repeat([0.5, 1.5, 2.5], 10)[:, None] + rng.normal(scale=0.01, size=(30, N))
+    task = Task("fetch", (Option(("a",), (Event("pick", {"a": q}),)),))
+    question = ([task], [], {"a": np.zeros(N)}, {"a": np.zeros(N)}, WEIGHTS)
+    found = skeletons(*question, limit=3, rng=rng)
+    assert [s.choices["fetch"][1] // 10 for s in found] == [0, 1, 2]
+    # Where no other place is left, what is near is better than nothing.
+    found = skeletons(*question, limit=6, rng=rng)
+    chosen = [s.choices["fetch"][1] for s in found]
+    assert len(set(chosen)) == 6 and {m // 10 for m in chosen} == {0, 1, 2}

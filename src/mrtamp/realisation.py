@@ -18,6 +18,7 @@ from mrtamp.optimise.yielding import Draft
 from mrtamp.plan import Plan, plan_cost
 from mrtamp.portfolio import Portfolio
 from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
+from mrtamp.skeletons import ALIKE
 from mrtamp.space_time import SpaceTime
 from mrtamp.tensor_tree import Node
 
@@ -59,7 +60,7 @@ class Realisation:
     incumbent : has plans judged.  portfolio : takes drafts, and knows which orders of events are under refinement.
     root : the tree's root, where every skeleton starts.
     to_beat : cost that a skeleton has to promise less than.
-    descent : shortens ways along their strata, once there is a plan; None: they stay as they were sampled.
+    descent : shortens ways along their strata; None: they stay as they were sampled.
     drafts : whether skeletons are also put under refinement as they are.
 
     Attributes
@@ -88,6 +89,7 @@ class Realisation:
         self.descent = descent
         self.drafts = drafts and portfolio.convex
         self.undrafted = self.drafts
+        self._drafted = _Drafted()
         self._turn = 0
 
     def attempt(self) -> Plan | Node | None:
@@ -194,11 +196,13 @@ class Realisation:
         if self._turn % 3 == 0:
             return False
         self.undrafted = False
+        self._drafted = _Drafted()
         drafts: list[tuple[float, Draft]] = []
         sketched = 0
         while sketched < _SKETCHED and len(drafts) < _DRAFTS:
             below = self.portfolio.worth_drafting(self.to_beat())
-            proposals = list(itertools.islice(self.skeletons.propose(below, _THOROUGH), _AT_ONCE))
+            found = self.skeletons.propose(below, _THOROUGH)
+            proposals = list(itertools.islice((p for p in found if not self._drafted.knows(p)), _AT_ONCE))
             if not proposals:
                 if not sketched:
                     # Nothing promises a gain, however it were realised.
@@ -220,6 +224,7 @@ class Realisation:
             return None
         draft = self.portfolio.yielding.time(*timed)
         if draft.conflict < _CONFLICT:
+            self._drafted.add(proposal)
             return draft
         self.skeletons.crowded(proposal, draft.conflict)
         return None
@@ -243,3 +248,32 @@ class Realisation:
             if best is None or (self._first and (good or len(proposal.stops) > _MANY)):
                 break
         return best
+
+
+class _Drafted:
+    """Skeletons with drafts of little conflict: others so much like them would be refined to the same plan."""
+
+    def __init__(self) -> None:
+        self._stops: dict[tuple, list[np.ndarray]] = {}
+
+    def add(self, proposal: Proposal) -> None:
+        """Remember a skeleton."""
+        self._stops.setdefault(proposal.skeleton.order, []).append(self._flat(proposal))
+
+    def knows(self, proposal: Proposal) -> bool:
+        """Whether the same robots did the same in the same order before, with every joint near to where it was.
+
+        Only of ways that were shortened: samples, however near, differ in what stands in the way of shortening them.
+        """
+        if not all(way.shortened for _, way in proposal.stops):
+            return False
+        flat = self._flat(proposal)
+        known = self._stops.get(proposal.skeleton.order, [])
+        return any(np.abs(flat - other).max(initial=0.0) < ALIKE for other in known)
+
+    @staticmethod
+    def _flat(proposal: Proposal) -> np.ndarray:
+        """All configurations in an order that does not depend on when things happen."""
+        happenings = zip(proposal.skeleton.happenings, proposal.stops, strict=True)
+        ordered = sorted(happenings, key=lambda x: (x[0].task, x[0].event))
+        return np.concatenate([q for _, (stop, _) in ordered for _, q in sorted(stop.q.items())])

@@ -28,6 +28,8 @@ _EXACT_TASKS = 8
 """Up to so many tasks dynamic programming over subsets is used."""
 _PARTITIONS = 100_000
 _EPS = 1e-9
+ALIKE = 0.25
+"""Largest difference of a joint (rad or m) between candidates from which refinement comes to the same, most likely."""
 
 
 @dataclass(frozen=True)
@@ -215,16 +217,26 @@ class _Pool:
             steps = plan.steps(ordering)
             assert steps is not None
             t = int(rng.integers(len(plan.tasks)))
-            used = {c[t] for o, c in taken if o == ordering.options}
-            free = [m for m in range(plan.tasks[t].options[ordering.options[t]].candidates) if m not in used]
-            if not free:
+            used = [c[t] for o, c in taken if o == ordering.options]
+            barred = _near(plan.tasks[t].options[ordering.options[t]], used)
+            if barred.all():
                 continue
             other = list(choice)
-            other[t] = free[0]
-            other = plan.polish(ordering, steps, other, {t: used})
+            other[t] = int(np.argmin(barred))
+            other = plan.polish(ordering, steps, other, {t: np.flatnonzero(barred)})
             skeleton = plan.skeleton(ordering, steps, other)
             key = (ordering.options, tuple(other))
             if skeleton.cost < FAR and key not in taken:
                 taken.add(key)
                 out.append(skeleton)
         return out
+
+
+def _near(option: Option, used: list[int]) -> np.ndarray:
+    """Candidates (M,) that are much like one of those in use, as long as there are others; then just these."""
+    itself = np.isin(np.arange(option.candidates), used)
+    near = itself.copy()
+    q = np.concatenate([x for event in option.events for x in event.stops.values()], axis=1)
+    for m in used:
+        near |= np.abs(q - q[m]).max(axis=1) < ALIKE
+    return itself if near.all() else near

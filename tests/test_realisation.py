@@ -1,0 +1,48 @@
+"""Which skeletons are drafted: those that refinement would bring to the same plan as another only once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mrtamp.options import Happening, Skeleton
+from mrtamp.realisation import _Drafted
+from mrtamp.skeleton_guidance import Proposal
+from mrtamp.skeletons import ALIKE
+from mrtamp.transitions.ways import Stop, Way
+
+ORDER = ((("red", 0, ("a",)), ("blue", 0, ("b",))),)
+
+
+def proposal(
+    red: list[float], blue: list[float], *, order: tuple = ORDER, turned: bool = False, shortened: bool = True
+) -> Proposal:
+    ways = {
+        item: Way((Stop("pick", (robot,), None, None, {robot: np.array(q)}),), shortened=shortened)
+        for item, robot, q in (("red", "a", red), ("blue", "b", blue))
+    }
+    happenings = tuple(Happening(item, 0, 0.0) for item in (reversed(ways) if turned else ways))
+    skeleton = Skeleton({item: (0, 0) for item in ways}, happenings, 1.0, 1.0, {}, order)
+    stops = tuple((ways[h.task].stops[0], ways[h.task]) for h in happenings)
+    return Proposal(skeleton, stops, ((), ()), 0)
+
+
+@pytest.mark.parametrize(
+    ("other", "known"),
+    [
+        (proposal([0.0, 0.0], [1.0, 1.0]), True),
+        (proposal([0.0, 0.9 * ALIKE], [1.0 - 0.9 * ALIKE, 1.0]), True),
+        (proposal([0.0, 0.0], [1.0, 1.0 + 1.1 * ALIKE]), False),
+        (proposal([1.0, 1.0], [0.0, 0.0]), False),
+        # Only when things happen is different, which the decoupled timing decides anew.
+        (proposal([0.0, 0.0], [1.0, 1.0], turned=True), True),
+        (proposal([0.0, 0.0], [1.0, 1.0], order=()), False),
+        (proposal([0.0, 0.0], [1.0, 1.0], shortened=False), False),
+    ],
+)
+def test_shortened_ways_near_to_drafted_ones_are_known(other: Proposal, known: bool) -> None:
+    drafted = _Drafted()
+    assert not drafted.knows(other)
+    drafted.add(proposal([5.0, 5.0], [5.0, 5.0]))
+    drafted.add(proposal([0.0, 0.0], [1.0, 1.0]))
+    assert drafted.knows(other) is known
