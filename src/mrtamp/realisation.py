@@ -21,6 +21,7 @@ from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
 from mrtamp.skeletons import ALIKE
 from mrtamp.space_time import SpaceTime
 from mrtamp.tensor_tree import Node
+from mrtamp.transitions.ways import Way
 
 _FIRST_WAYS, _MORE_WAYS = (80, 14), (64, 20)
 """IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
@@ -106,10 +107,10 @@ class Realisation:
             return None
         tries = 0
         while tries < _REALISATIONS:
-            failed: set[int] = set()
+            failed: set[Way] = set()
             inserted: list[tuple[float, Timed, SpaceTime, Proposal]] = []
             for proposal in self.skeletons.propose(self.to_beat(), _QUICK if first else _THOROUGH):
-                if failed & {id(way) for _, way in proposal.stops}:
+                if failed & set(proposal.ways):
                     # The guidance has learnt something about these since.
                     continue
                 tries += 1
@@ -123,7 +124,7 @@ class Realisation:
                 if node is not None:
                     self.skeletons.realised(proposal)
                     return node
-                failed = {id(way) for _, way in proposal.stops if way.failures}
+                failed = {way for way in proposal.ways if way.failures}
                 if tries >= _REALISATIONS:
                     break
             # An order of events that is under refinement already has had its chance.
@@ -265,7 +266,7 @@ class _Drafted:
 
         Only of ways that were shortened: samples, however near, differ in what stands in the way of shortening them.
         """
-        if not all(way.shortened for _, way in proposal.stops):
+        if not all(way.shortened for way in proposal.ways):
             return False
         flat = self._flat(proposal)
         known = self._stops.get(proposal.skeleton.order, [])

@@ -65,6 +65,11 @@ class Proposal:
     before: tuple[tuple[int, ...], ...]
     repeated: int
 
+    @property
+    def ways(self) -> list[Way]:
+        """The ways that the stops belong to, each once."""
+        return list(dict.fromkeys(way for _, way in self.stops))
+
 
 class SkeletonGuidance:
     """Grows ways, proposes skeletons, and learns from their realisation.
@@ -184,7 +189,7 @@ class SkeletonGuidance:
     def _in_context(self, proposal: Proposal) -> Iterator[tuple[Way, dict[str, Surroundings]]]:
         """The ways of a proposal with what their robots do before and after; what nobody waits for counts less."""
         ends, slack = self._ends(), self._slack(proposal)
-        for way in {id(way): way for _, way in proposal.stops}.values():
+        for way in proposal.ways:
             around = {}
             for r in way.robots:
                 course = [k for k, (stop, _) in enumerate(proposal.stops) if r in stop.robots]
@@ -326,8 +331,7 @@ class SkeletonGuidance:
         )
         constant = self.problem.cost.of_changes(s.kind for s in stops)
         penalty = np.array([w.penalty for w in ways]) if penalised else None
-        robots = tuple(dict.fromkeys(r for s in stops for r in s.robots))
-        return Option(robots, events, constant, penalty)
+        return Option(ways[0].robots, events, constant, penalty)
 
     def _question(self, sets: Mapping[str, list[list[Way]]], *, penalised: bool) -> tuple:
         """Tasks, precedence, starts, ends and weights, as the search for skeletons and the bound take them."""
@@ -422,16 +426,15 @@ class SkeletonGuidance:
         way.failures += 1
         way.penalty += _FAILED
 
-    def refused(self, proposal: Proposal) -> set[int]:
-        """The judge objects to realisations of this; the numbers (`id`) of its ways, which seem dearer now."""
-        ways = {id(way): way for _, way in proposal.stops}
-        for way in ways.values():
+    def refused(self, proposal: Proposal) -> set[Way]:
+        """The judge objects to realisations of this; its ways, which seem dearer now."""
+        for way in proposal.ways:
             self.failed(way)
-        return set(ways)
+        return set(proposal.ways)
 
     def crowded(self, proposal: Proposal, conflict: float) -> None:
         """Robots would collide a lot on these ways; whose ways are to blame is left to chance."""
-        for way in {id(way): way for _, way in proposal.stops}.values():
+        for way in proposal.ways:
             if self.rng.random() < 0.5:
                 way.penalty += _CROWDED * conflict
 
@@ -452,12 +455,12 @@ class SkeletonGuidance:
                     if a.object == item:
                         q = {r: segment.q[r][-1].copy() for r in a.robots}
                         stops.append(Stop(a.kind, a.robots, a.before, a.after, q))
-            robots = tuple(dict.fromkeys(r for s in stops for r in s.robots))
+            way = Way(tuple(stops), shortened=True)
             kinds = [s.kind for s in stops]
-            if (kinds, len(robots)) not in ((["pick", "place"], 1), (["pick", "handover", "place"], 2)):
+            if (kinds, len(way.robots)) not in ((["pick", "place"], 1), (["pick", "handover", "place"], 2)):
                 continue
             if stops[0].before is self.root.of[item]:
-                self.ways.of.setdefault((item, robots), []).append(Way(tuple(stops), shortened=True))
+                self.ways.of.setdefault((item, way.robots), []).append(way)
 
     # -- realisation ----------------------------------------------------------------------------------------------
 
