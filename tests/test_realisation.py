@@ -11,15 +11,21 @@ from mrtamp.skeleton_guidance import Proposal
 from mrtamp.skeletons import ALIKE
 from mrtamp.transitions.ways import Stop, Way
 
-ORDER = ((("red", 0, ("a",)), ("blue", 0, ("b",))),)
+ORDER = ((("red", 0, ("a", "b")), ("blue", 0, ("a", "b"))),)
 
 
 def proposal(
-    red: list[float], blue: list[float], *, order: tuple = ORDER, turned: bool = False, shortened: bool = True
+    red: list[float],
+    blue: list[float],
+    *,
+    order: tuple = ORDER,
+    turned: bool = False,
+    shortened: bool = True,
+    robots: tuple[str, ...] = ("a", "b"),
 ) -> Proposal:
     ways = {
-        item: Way((Stop("pick", (robot,), None, None, {robot: np.array(q)}),), shortened=shortened)
-        for item, robot, q in (("red", "a", red), ("blue", "b", blue))
+        item: Way((Stop("handover", robots, None, None, {r: np.array(q) for r in robots}),), shortened=shortened)
+        for item, q in (("red", red), ("blue", blue))
     }
     happenings = tuple(Happening(item, 0, 0.0) for item in (reversed(ways) if turned else ways))
     skeleton = Skeleton({item: (0, 0) for item in ways}, happenings, 1.0, 1.0, {}, order)
@@ -38,11 +44,12 @@ def proposal(
         (proposal([0.0, 0.0], [1.0, 1.0], turned=True), True),
         (proposal([0.0, 0.0], [1.0, 1.0], order=()), False),
         (proposal([0.0, 0.0], [1.0, 1.0], shortened=False), False),
+        (proposal([0.0, 0.0], [1.0, 1.0], robots=("a",)), False),
     ],
 )
-def test_shortened_ways_near_to_drafted_ones_are_known(other: Proposal, known: bool) -> None:
+def test_shortened_handovers_near_to_drafted_ones_are_known(other: Proposal, known: bool) -> None:
     drafted = _Drafted()
     assert not drafted.knows(other)
     drafted.add(proposal([5.0, 5.0], [5.0, 5.0]))
-    drafted.add(proposal([0.0, 0.0], [1.0, 1.0]))
+    drafted.add(proposal([0.0, 0.0], [1.0, 1.0], robots=other.ways[0].robots))
     assert drafted.knows(other) is known

@@ -264,9 +264,10 @@ class _Drafted:
     def knows(self, proposal: Proposal) -> bool:
         """Whether the same robots did the same in the same order before, with every joint near to where it was.
 
-        Only of ways that were shortened: samples, however near, differ in what stands in the way of shortening them.
+        Only of skeletons whose every way has a handover and was shortened: those near to each other have the same
+        optimum. What differs little elsewhere differs in who is in whose way, and to try again has paid.
         """
-        if not all(way.shortened for way in proposal.ways):
+        if not all(way.shortened and len(way.robots) > 1 for way in proposal.ways):
             return False
         flat = self._flat(proposal)
         known = self._stops.get(proposal.skeleton.order, [])
