@@ -220,6 +220,7 @@ def test_edges_made_while_a_search_runs_are_not_blocked(roadmap: Roadmap) -> Non
     blocked = np.ones(roadmap.n_edges, dtype=bool)
     roadmap.edge(0, 150)
     assert roadmap.shortest(0, 150, blocked) == [0, 150]
+    assert roadmap.shortest(0, 150, blocked[:0]) == [0, 150]
 
 
 def test_lengths_are_distances_whether_there_is_an_edge_or_not(roadmap: Roadmap) -> None:

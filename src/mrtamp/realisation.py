@@ -90,7 +90,6 @@ class Realisation:
         self.descent = descent
         self.drafts = drafts and portfolio.convex
         self.undrafted = self.drafts
-        self._drafted = _Drafted()
         self._turn = 0
 
     def attempt(self) -> Plan | Node | None:
@@ -197,13 +196,13 @@ class Realisation:
         if self._turn % 3 == 0:
             return False
         self.undrafted = False
-        self._drafted = _Drafted()
+        drafted = _Drafted()
         drafts: list[tuple[float, Draft]] = []
         sketched = 0
         while sketched < _SKETCHED and len(drafts) < _DRAFTS:
             below = self.portfolio.worth_drafting(self.to_beat())
             found = self.skeletons.propose(below, _THOROUGH)
-            proposals = list(itertools.islice((p for p in found if not self._drafted.knows(p)), _AT_ONCE))
+            proposals = list(itertools.islice((p for p in found if not drafted.knows(p)), _AT_ONCE))
             if not proposals:
                 if not sketched:
                     # Nothing promises a gain, however it were realised.
@@ -213,6 +212,7 @@ class Realisation:
                 sketched += 1
                 draft = self._sketch(proposal)
                 if draft is not None:
+                    drafted.add(proposal)
                     drafts.append((proposal.skeleton.cost, draft))
         drafts.sort(key=lambda x: x[0] * (1 + _DETERRENT * x[1].conflict))
         return self.portfolio.add_drafts(drafts[:_DRAFTS]) > 0
@@ -225,7 +225,6 @@ class Realisation:
             return None
         draft = self.portfolio.yielding.time(*timed)
         if draft.conflict < _CONFLICT:
-            self._drafted.add(proposal)
             return draft
         self.skeletons.crowded(proposal, draft.conflict)
         return None

@@ -123,7 +123,7 @@ class Roadmap:
             self._join(i, np.arange(n), np.linalg.norm(self._open_q[:n] - self._q[i], axis=1))
 
     def _join(self, i: int, others: np.ndarray, distance: np.ndarray) -> None:
-        """Edges to the nearest of some open vertices (by their number among these), of which all nearest ones are."""
+        """Edges to the k nearest open vertices, which are among `others` (their numbers in the list of open ones)."""
         k = prm_star_neighbours(len(self._open), self.n_dof)
         nearest = np.argpartition(distance, k)[:k] if k < len(distance) else np.arange(len(distance))
         nearest = nearest[np.argsort(distance[nearest], kind="stable")]
@@ -366,7 +366,7 @@ class ShortestPaths:
         known = len(self._blocked)
         if self._roadmap.n_edges <= known:
             return ~self._blocked[edges]
-        return (edges >= known) | ~self._blocked[np.minimum(edges, known - 1)]
+        return ~np.append(self._blocked, False)[np.minimum(edges, known)]
 
 
 def prm_star_neighbours(n: int, dof: int) -> int:
