@@ -109,7 +109,7 @@ class Realisation:
             failed: set[Way] = set()
             inserted: list[tuple[float, Timed, SpaceTime, Proposal]] = []
             for proposal in self.skeletons.propose(self.to_beat(), _QUICK if first else _THOROUGH):
-                if failed & set(proposal.ways):
+                if not failed.isdisjoint(proposal.ways):
                     # The guidance has learnt something about these since.
                     continue
                 tries += 1

@@ -428,9 +428,10 @@ class SkeletonGuidance:
 
     def refused(self, proposal: Proposal) -> set[Way]:
         """The judge objects to realisations of this; its ways, which seem dearer now."""
-        for way in proposal.ways:
+        ways = set(proposal.ways)
+        for way in ways:
             self.failed(way)
-        return set(proposal.ways)
+        return ways
 
     def crowded(self, proposal: Proposal, conflict: float) -> None:
         """Robots would collide a lot on these ways; whose ways are to blame is left to chance."""
