@@ -246,8 +246,8 @@ class MotionJudge:
         """Note the samples in collision, and bisect the stretches that their ends do not certify."""
         hits = _Hits(self.world, line)
         hit = pairs.inside(s[:, None], slice(None)) & (d <= 0.0)
-        for n in np.flatnonzero(hit.any(axis=1)):
-            hit[n] &= not self._tolerated(line, float(s[n]), exempt)
+        touched = np.flatnonzero(hit.any(axis=1))
+        hit[touched] &= ~self._tolerated(line, s[touched], exempt)[:, None]
         for n, c in zip(*np.nonzero(hit), strict=True):
             hits.note(pairs.solids[c], float(s[n]), float(d[n, c]))
         if hits and report.first_only:
@@ -268,8 +268,10 @@ class MotionJudge:
             inside = pairs.inside(middle, pair)
             report.clearance(dm[inside])
             hit = inside & (dm <= 0.0)
-            for n in np.unique(at[hit]):
-                hit[at == n] &= not self._tolerated(line, float(samples[n]), exempt)
+            touched = np.unique(at[hit])
+            bad = np.zeros(len(samples), dtype=bool)
+            bad[touched] = ~self._tolerated(line, samples[touched], exempt)
+            hit &= bad[at]
             for row in np.flatnonzero(hit):
                 hits.note(pairs.solids[pair[row]], float(middle[row]), float(dm[row]))
             # A pair that collides is not searched any further here: its stretch is known to be bad.
@@ -282,18 +284,23 @@ class MotionJudge:
             lo, hi, d0, d1, pair = lo[keep], hi[keep], d0[keep], d1[keep], pair[keep]
         return hits
 
-    def _tolerated(self, line: Timeline, s: float, exempt: Mapping[tuple[str, str], tuple[float, float]]) -> bool:
-        """Whether all penetrations of the configuration at s add up to no more than the problem tolerates."""
-        if self.tolerance <= 0.0:
-            return False
-        q, _ = line.state(np.array([s]))
-        total = 0.0
-        for pair, depth in self.world.penetrations(self.world.query(q[0])).items():
-            one, two = (self.world.solids[i].side.owner for i in pair)
-            low, high = exempt.get((one, two)) or exempt.get((two, one)) or (0.0, line.length)
-            if pair not in line.motion.allowed and low <= s <= high:
-                total += depth
-        return total <= self.tolerance
+    def _tolerated(
+        self, line: Timeline, s: np.ndarray, exempt: Mapping[tuple[str, str], tuple[float, float]]
+    ) -> np.ndarray:
+        """At which s (S,) all penetrations of the configuration add up to no more than the problem tolerates."""
+        out = np.zeros(len(s), dtype=bool)
+        if self.tolerance <= 0.0 or not len(s):
+            return out
+        q, _ = line.state(s)
+        for k, at in enumerate(s):
+            total = 0.0
+            for pair, depth in self.world.penetrations(self.world.query(q[k])).items():
+                one, two = (self.world.solids[i].side.owner for i in pair)
+                low, high = exempt.get((one, two)) or exempt.get((two, one)) or (0.0, line.length)
+                if pair not in line.motion.allowed and low <= at <= high:
+                    total += depth
+            out[k] = total <= self.tolerance
+        return out
 
     def resting(
         self, motion: Motion, names: list[str], report: Report, standing: Collection[tuple[str, str]] = ()

@@ -31,6 +31,8 @@ _TRIAL = 5
 """Conic programs that a plan gets before it is compared with the others."""
 _HOPELESS = 1.12
 """Plans that cost so many times the incumbent after their trial wait until nothing else is left to do."""
+_LUCK = 0.93
+"""A draft may come to so many times less than the best one so far, relative to what their skeletons promised."""
 _NEARLY = 0.97
 """A plan whose current iterate costs less than the incumbent times this goes on until it is free of collision."""
 _LATELY, _CRAWL = 5, 0.01
@@ -132,7 +134,7 @@ class Portfolio:
 
     def worth_drafting(self, incumbent: float) -> float:
         """Estimate below which drafts may come to beat the incumbent, from what became of those so far."""
-        return _NEARLY * incumbent / self._share if self._share else incumbent
+        return _NEARLY * incumbent / (_LUCK * self._share) if self._share else incumbent
 
     def knows(self, transitions: Sequence[Transition]) -> bool:
         """Whether a plan with the same order of events is under refinement."""
@@ -195,15 +197,20 @@ class Portfolio:
         return all(e.done and (e.fruitless >= _ROUNDS or e.cost >= _HOPELESS * incumbent) for e in self._entries)
 
     def _choose(self, incumbent: float) -> _Entry | None:
-        """One that is about to beat the incumbent, else one on trial, the newest first, else one that goes on.
+        """One that is about to beat the incumbent; else the incumbent itself after its first round, which re-timing
+        and finer steps gain most for; else one on trial, the newest first; else one that goes on.
 
+        What drafts seem to cost before their first program says nothing: those on trial begin with the most promising.
         Drafts are given up once no draft so far has ended cheap enough for them to matter.
         """
         most = self.worth_drafting(incumbent)
         self._entries = [e for e in self._entries if not (e.draft and self._share and e.estimate > most)]
-        near = [e for e in self._entries if e.optimiser is not None and e.outlook < _NEARLY * incumbent]
+        near = [e for e in self._entries if e.trail and e.outlook < _NEARLY * incumbent]
         if near:
             return min(near, key=lambda e: e.outlook)
+        first = next((e for e in self._entries if e.done and e.rounds == 1 and e.cost <= incumbent), None)
+        if first is not None:
+            return self._again(first)
         trial = [e for e in self._entries if e.on_trial]
         if trial:
             return trial[-1]
@@ -213,10 +220,14 @@ class Portfolio:
         waiting = [e for e in self._entries if not e.done]
         rested = [e for e in self._entries if e.done and e.fruitless < _ROUNDS and e.cost < _HOPELESS * incumbent]
         if rested:
-            entry = min(rested, key=lambda e: e.cost * (1 + 0.02 * e.fruitless))
-            entry.refiner, entry.optimiser, entry.proposals, entry.done = None, None, 0, False
-            return entry
+            return self._again(min(rested, key=lambda e: e.cost * (1 + 0.02 * e.fruitless)))
         return min(waiting, key=lambda e: e.cost, default=None)
+
+    @staticmethod
+    def _again(entry: _Entry) -> _Entry:
+        """A plan that goes on to its next round."""
+        entry.refiner, entry.optimiser, entry.proposals, entry.done = None, None, 0, False
+        return entry
 
     def _shorten(self, entry: _Entry, incumbent: float) -> Plan | None:
         if entry.refiner is None:

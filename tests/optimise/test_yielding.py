@@ -14,7 +14,7 @@ from gantry import gantry_problem, valid_plan
 from mrtamp.check import Checker
 from mrtamp.collision import Collision
 from mrtamp.optimise.nearness import Nearness
-from mrtamp.optimise.yielding import Draft, Yielding
+from mrtamp.optimise.yielding import _EARLY, Draft, Yielding
 from mrtamp.plan import Plan, plan_cost
 from mrtamp.problem import Problem
 
@@ -22,8 +22,9 @@ THICK = 0.1
 """Of the discs (m): what overlaps by more parts upwards."""
 
 
-def timed(plan: Plan) -> Draft:
-    return Yielding(plan.problem, Nearness(Collision(plan.problem))).time(plan.segments, plan.transitions)
+def timed(plan: Plan, *, early: bool = False) -> Draft:
+    yielding = Yielding(plan.problem, Nearness(Collision(plan.problem)))
+    return yielding.time(plan.segments, plan.transitions, early=early)
 
 
 def crossing(problem: Problem, a_to: tuple[float, float], b_to: tuple[float, float]) -> Plan:
@@ -38,17 +39,26 @@ def depth(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.clip(2 * RADIUS - np.linalg.norm(a - b), 0.0, THICK))
 
 
-def cheapest(a: np.ndarray, b: np.ndarray) -> float:
+def to_go(way: np.ndarray) -> np.ndarray:
+    """Length (T,) of what is left of a way (T, 2) from each of its nodes on."""
+    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    return np.append(np.cumsum(steps[::-1])[::-1], 0.0)
+
+
+def cheapest(a: np.ndarray, b: np.ndarray, *, early: bool) -> float:
     """Over all monotone paths on the grid of two ways (T, 2), (N, 2)."""
     graph = nx.DiGraph()
+    left = to_go(a)[:, None] + to_go(b)
+    haste = 1 + _EARLY * early * left / left[0, 0]
     for i, j in product(range(len(a)), range(len(b))):
         for k, m in ((i + 1, j), (i, j + 1), (i + 1, j + 1)):
             if k < len(a) and m < len(b):
                 longest = max(np.linalg.norm(a[k] - a[i]), np.linalg.norm(b[m] - b[j]))
-                graph.add_edge((i, j), (k, m), weight=charged(float(longest), depth(a[k], b[m])))
+                graph.add_edge((i, j), (k, m), weight=haste[k, m] * charged(float(longest), depth(a[k], b[m])))
     return float(nx.dijkstra_path_length(graph, (0, 0), (len(a) - 1, len(b) - 1)))
 
 
+@pytest.mark.parametrize("early", [False, True])
 @pytest.mark.parametrize(
     ("a_to", "b_to"),
     [
@@ -58,24 +68,44 @@ def cheapest(a: np.ndarray, b: np.ndarray) -> float:
         ((0.5, -0.7), (-0.5, -0.7)),  # no timing helps: they have to go through each other
     ],
 )
-def test_two_discs_wait_for_each_other_as_brute_force_has_it(tmp_path: Path, a_to: tuple, b_to: tuple) -> None:
+def test_two_discs_wait_for_each_other_as_brute_force_has_it(
+    tmp_path: Path, a_to: tuple, b_to: tuple, early: bool
+) -> None:
     problem = disc_problem(tmp_path)
-    draft = timed(crossing(problem, a_to, b_to))
+    draft = timed(crossing(problem, a_to, b_to), early=early)
     [segment] = draft.segments
     a, b = segment.q["a"], segment.q["b"]
     cost = conflict = 0.0
+    left = to_go(a) + to_go(b)
     for i, j in pairwise(range(len(a))):
         longest = max(np.linalg.norm(a[j] - a[i]), np.linalg.norm(b[j] - b[i]))
-        cost += charged(float(longest), depth(a[j], b[j]))
+        cost += (1 + _EARLY * early * left[j] / left[0]) * charged(float(longest), depth(a[j], b[j]))
         conflict += float(longest) * depth(a[j], b[j]) ** 2
     ways = []
     for robot, to in zip(problem.robots, (a_to, b_to), strict=True):
         length = float(np.linalg.norm(np.array(to) - robot.start))
         ways.append(np.linspace(robot.start, to, int(np.ceil(length / 0.3 - 1e-9)) + 1))
-    assert cost == pytest.approx(cheapest(*ways), rel=2e-3)
+    assert cost == pytest.approx(cheapest(*ways, early=early), rel=2e-3)
     assert draft.conflict == pytest.approx(conflict, abs=1e-5)
     for robot, to, q in zip(problem.robots, (a_to, b_to), (a, b), strict=True):
         assert np.array_equal(q[0], robot.start) and np.allclose(q[-1], to)
+
+
+def test_who_waits_sets_out_late_or_comes_as_near_as_it_can(tmp_path: Path) -> None:
+    """b crosses a's way and goes on; a has to wait for it, and for nothing else."""
+    plan = crossing(disc_problem(tmp_path), (0.5, -1.5), (-0.5, -1.5))
+    late, early = timed(plan), timed(plan, early=True)
+    ends = [plan_cost(d.segments, d.transitions, plan.problem.cost) for d in (late, early)]
+    assert ends[1] <= (1 + _EARLY) * ends[0]
+
+    def behind(draft: Draft) -> float:
+        """What is still to be done (m), over the time (m) that goes by."""
+        [segment] = draft.segments
+        left = sum(to_go(q) for q in segment.q.values())
+        time = np.max([np.linalg.norm(np.diff(q, axis=0), axis=1) for q in segment.q.values()], axis=0)
+        return float(np.asarray(left)[1:] @ time)
+
+    assert behind(early) < behind(late) - 0.1
 
 
 def test_waiting_takes_the_place_of_a_collision(tmp_path: Path) -> None:

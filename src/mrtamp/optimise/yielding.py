@@ -24,6 +24,8 @@ _STEP = 0.3
 """Longest step (rad or m) of a robot along its way."""
 _CHARGE = (10.0, 300.0)
 """By how many times motion at a penetration of 1 m seems longer than it is: linear and quadratic in the depth."""
+_EARLY = 0.3
+"""By how much time counts more in the beginning than in the end where robots are to be early."""
 _NEVER = 1e6
 """What it costs to do something too early."""
 
@@ -102,8 +104,12 @@ class Yielding:
         self._X_WP = {**static_poses(problem), **nowhere}
         self._radius = {o: r for w in nearness.worlds.values() for o, r in w.object_radius.items()}
 
-    def time(self, segments: Sequence[Segment], transitions: Sequence[Transition]) -> Draft:
-        """The same ways timed anew; events of different robots change places where nothing speaks against it."""
+    def time(self, segments: Sequence[Segment], transitions: Sequence[Transition], *, early: bool = False) -> Draft:
+        """The same ways timed anew; events of different robots change places where nothing speaks against it.
+
+        Where it hardly makes a difference to when all is over, robots that have to wait do so before they set out;
+        `early`: as far along their ways as they can get.
+        """
         courses = {r: self._course(r, segments, transitions) for r in segments[0].q}
         rests = self._rests([s.mode for s in segments])
         before = self._precedence(transitions, rests)
@@ -111,7 +117,7 @@ class Yielding:
         nodes = {names[0]: np.arange(len(courses[names[0]].q))}
         conflict = 0.0
         for name in names[1:]:
-            nodes, more = self._join(courses, nodes, name, rests, before)
+            nodes, more = self._join(courses, nodes, name, rests, before, early)
             conflict += more
         return Draft(*_timed(segments[0].mode, transitions, courses, nodes), conflict)
 
@@ -181,6 +187,7 @@ class Yielding:
         robot: str,
         rests: Sequence[_Rest],
         before: Mapping[int, set[int]],
+        early: bool,
     ) -> tuple[dict[str, np.ndarray], float]:
         """Nodes (T',) of all robots at instants, and their conflict, once `robot` is timed against those in `nodes`."""
         course = courses[robot]
@@ -203,7 +210,7 @@ class Yielding:
         step = np.zeros(instants)
         for r, at in nodes.items():
             step = np.maximum(step, np.where(np.diff(at, prepend=0) > 0, courses[r].step[at], 0.0))
-        row, column, conflict = _cheapest(step, course.step, depth, never)
+        row, column, conflict = _cheapest(step, course.step, depth, never, _EARLY if early else 0.0)
         return {**{r: at[row] for r, at in nodes.items()}, robot: column}, conflict
 
     def _depths(self, one: str, a: _Course, used: np.ndarray, two: str, b: _Course) -> np.ndarray:
@@ -294,13 +301,16 @@ def _overlapping(a: State, b: State) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cheapest(
-    rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, never: np.ndarray
+    rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, never: np.ndarray, early: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """A cheapest monotone path from corner to corner: rows (P,), columns (P,), and the squared depth along it.
 
-    A step of rows (T,) and columns (N,), or of one of them, takes as long as the longer of the two.
+    A step of rows (T,) and columns (N,), or of one of them, takes as long as the longer of the two; with everything
+    still ahead it costs by the share `early` more than in the end.
     """
-    charge = 1 + _CHARGE[0] * depth + _CHARGE[1] * depth**2
+    ahead = (rows.sum() - np.cumsum(rows))[:, None] + columns.sum() - np.cumsum(columns)
+    haste = 1 + early * ahead / max(float(ahead[0, 0]), 1e-9)
+    charge = (1 + _CHARGE[0] * depth + _CHARGE[1] * depth**2) * haste
     cost = np.full(depth.shape, np.inf)
     along = np.cumsum(columns * charge + _NEVER * never, axis=1)
     both = np.maximum(rows[:, None], columns[None]) * charge
