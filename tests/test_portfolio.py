@@ -65,6 +65,32 @@ def test_a_plan_is_taken_once_and_only_so_many_are_kept(tmp_path: Path) -> None:
     assert len(planner.portfolio._entries) == SIZE
 
 
+def test_the_incumbent_has_its_second_round_before_others_have_their_trial(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    portfolio, best = planner.portfolio, roundabout(planner, 0.6)
+    portfolio.add(best)
+    [entry] = portfolio._entries
+    while not entry.done:
+        best = portfolio.improve(best.cost) or best
+    assert entry.rounds == 1
+    assert portfolio.add(roundabout(planner, -0.9))
+    assert portfolio._choose(best.cost) is entry
+    while entry.rounds == 1:
+        best = portfolio.improve(best.cost) or best
+    assert portfolio._choose(best.cost) is not entry, "now it is the other's turn"
+
+
+def test_drafts_begin_with_the_most_promising_whatever_they_seem_to_cost(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    portfolio = planner.portfolio
+    plans = [roundabout(planner, height) for height in (0.2, 0.9, 0.5)]
+    assert plans[1].cost < plans[0].cost
+    portfolio.add_drafts([(1.0, portfolio.yielding.time(p.segments, p.transitions)) for p in plans])
+    first = portfolio._entries[-1]
+    assert portfolio._choose(10 * plans[0].cost) is first
+    assert first.plan.cost == max(e.plan.cost for e in portfolio._entries)
+
+
 def test_drafts_that_are_free_count_as_plans_and_make_room_for_themselves(tmp_path: Path) -> None:
     planner = planner_for(tmp_path)
     portfolio = planner.portfolio

@@ -160,10 +160,14 @@ class Portfolio:
         return len(fresh)
 
     def _admit(self, fresh: list[_Entry]) -> None:
-        """Take entries in; when there are too many the dearest of the others go, finished ones first, drafts last."""
+        """Take entries in; when there are too many the dearest of the others go, finished ones first, drafts last.
+
+        The cheapest of all stays.
+        """
         self._entries += fresh
         while len(self._entries) > SIZE:
-            others = [e for e in self._entries if e not in fresh]
+            best = min(self._entries, key=lambda e: e.cost)
+            others = [e for e in self._entries if e not in fresh and e is not best]
             going = [e for e in others if e.done] or [e for e in others if not e.draft] or others
             self._entries.remove(max(going, key=lambda e: e.cost))
 
@@ -201,16 +205,21 @@ class Portfolio:
         and finer steps gain most for; else one on trial, the newest first; else one that goes on.
 
         What drafts seem to cost before their first program says nothing: those on trial begin with the most promising.
-        Drafts are given up once no draft so far has ended cheap enough for them to matter.
+        Drafts are given up once no draft so far has ended cheap enough for them to matter, or if they are no cheaper
+        than the incumbent after their trial: to come free of collision costs them more still.
         """
         most = self.worth_drafting(incumbent)
-        self._entries = [e for e in self._entries if not (e.draft and self._share and e.estimate > most)]
+        self._entries = [
+            e
+            for e in self._entries
+            if not (e.draft and ((self._share and e.estimate > most) or (not e.on_trial and e.outlook >= incumbent)))
+        ]
         near = [e for e in self._entries if e.trail and e.outlook < _NEARLY * incumbent]
         if near:
             return min(near, key=lambda e: e.outlook)
-        first = next((e for e in self._entries if e.done and e.rounds == 1 and e.cost <= incumbent), None)
+        first = next((e for e in self._entries if e.rounds == 1 and e.cost <= incumbent), None)
         if first is not None:
-            return self._again(first)
+            return self._again(first) if first.done else first
         trial = [e for e in self._entries if e.on_trial]
         if trial:
             return trial[-1]
