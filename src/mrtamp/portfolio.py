@@ -41,6 +41,7 @@ _ROUNDS = 3
 """Times that a finished plan is shaken and refined again without gain before it is left alone."""
 _ALIKE = 0.02
 """Relative difference of cost below which two plans with the same order of events are held to be alike."""
+_EPS = 1e-9
 WORTH_CHECKING = 0.002
 """Relative gain over the incumbent that is worth a check."""
 
@@ -201,8 +202,8 @@ class Portfolio:
         return all(e.done and (e.fruitless >= _ROUNDS or e.cost >= _HOPELESS * incumbent) for e in self._entries)
 
     def _choose(self, incumbent: float) -> _Entry | None:
-        """One that is about to beat the incumbent; else the incumbent itself after its first round, which re-timing
-        and finer steps gain most for; else one on trial, the newest first; else one that goes on.
+        """One that is about to beat the incumbent; else the incumbent itself from its trial to the end of its second
+        round, where re-timing and finer steps gain most; else one on trial, the newest first; else one that goes on.
 
         What drafts seem to cost before their first program says nothing: those on trial begin with the most promising.
         Drafts are given up once no draft so far has ended cheap enough for them to matter, or if they are no cheaper
@@ -217,9 +218,10 @@ class Portfolio:
         near = [e for e in self._entries if e.trail and e.outlook < _NEARLY * incumbent]
         if near:
             return min(near, key=lambda e: e.outlook)
-        first = next((e for e in self._entries if e.rounds == 1 and e.cost <= incumbent), None)
-        if first is not None:
-            return self._again(first) if first.done else first
+        ahead = [e for e in self._entries if e.cost <= incumbent + _EPS and e.rounds < 2]
+        ahead = [e for e in ahead if e.rounds or not e.on_trial]
+        if ahead:
+            return self._again(ahead[0]) if ahead[0].done else ahead[0]
         trial = [e for e in self._entries if e.on_trial]
         if trial:
             return trial[-1]
