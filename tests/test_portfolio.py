@@ -76,6 +76,7 @@ def test_the_incumbent_has_its_second_round_before_others_have_their_trial(tmp_p
     assert portfolio.add(roundabout(planner, -0.9))
     assert portfolio._choose(best.cost) is entry
     while entry.rounds == 1:
+        assert portfolio._choose(best.cost) is entry, "until it is over"
         best = portfolio.improve(best.cost) or best
     assert portfolio._choose(best.cost) is not entry, "now it is the other's turn"
 
