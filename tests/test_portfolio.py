@@ -68,8 +68,9 @@ def test_a_plan_is_taken_once_and_only_so_many_are_kept(tmp_path: Path) -> None:
 def test_the_incumbent_has_its_second_round_before_others_have_their_trial(tmp_path: Path) -> None:
     planner = planner_for(tmp_path)
     portfolio, best = planner.portfolio, roundabout(planner, 0.6)
-    portfolio.add(best)
+    portfolio.add_drafts([(best.cost, portfolio.yielding.time(best.segments, best.transitions))])
     [entry] = portfolio._entries
+    best = entry.plan
     while not entry.done:
         best = portfolio.improve(best.cost) or best
     assert entry.rounds == 1

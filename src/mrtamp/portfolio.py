@@ -57,6 +57,8 @@ class _Entry:
     draft: bool = False
     estimate: float = np.nan
     """What its skeleton was to cost, of a draft."""
+    of_draft: bool = False
+    """Whether it was one."""
     resolution: float = RESOLUTION
     refiner: Refiner | None = None
     optimiser: Optimiser | None = None
@@ -154,7 +156,7 @@ class Portfolio:
                 continue
             self._seen.add(round(plan.cost, 6))
             free = self.incumbent.accepted(draft.segments, draft.transitions) if draft.conflict == 0.0 else None
-            entry = _Entry(free or plan, draft=free is None, estimate=estimate)
+            entry = _Entry(free or plan, draft=free is None, estimate=estimate, of_draft=True)
             entry.optimiser = self._optimiser(entry)
             fresh.append(entry)
         self._admit(fresh[::-1])
@@ -202,8 +204,9 @@ class Portfolio:
         return all(e.done and (e.fruitless >= _ROUNDS or e.cost >= _HOPELESS * incumbent) for e in self._entries)
 
     def _choose(self, incumbent: float) -> _Entry | None:
-        """One that is about to beat the incumbent; else the incumbent itself from its trial to the end of its second
-        round, where re-timing and finer steps gain most; else one on trial, the newest first; else one that goes on.
+        """One that is about to beat the incumbent; else the incumbent itself, if a draft has become it, from its trial
+        to the end of its second round, where re-timing and finer steps gain most; else one on trial, the newest first;
+        else one that goes on.
 
         What drafts seem to cost before their first program says nothing: those on trial begin with the most promising.
         Drafts are given up once no draft so far has ended cheap enough for them to matter, or if they are no cheaper
@@ -218,7 +221,7 @@ class Portfolio:
         near = [e for e in self._entries if e.trail and e.outlook < _NEARLY * incumbent]
         if near:
             return min(near, key=lambda e: e.outlook)
-        ahead = [e for e in self._entries if e.cost <= incumbent + _EPS and e.rounds < 2]
+        ahead = [e for e in self._entries if e.of_draft and e.cost <= incumbent + _EPS and e.rounds < 2]
         ahead = [e for e in ahead if e.rounds or not e.on_trial]
         if ahead:
             return self._again(ahead[0]) if ahead[0].done else ahead[0]
