@@ -247,7 +247,7 @@ class MotionJudge:
         hits = _Hits(self.world, line)
         hit = pairs.inside(s[:, None], slice(None)) & (d <= 0.0)
         touched = np.flatnonzero(hit.any(axis=1))
-        hit[touched] &= ~self._tolerated(line, s[touched], exempt)[:, None]
+        hit[touched[self._tolerated(line, s[touched], exempt)]] = False
         for n, c in zip(*np.nonzero(hit), strict=True):
             hits.note(pairs.solids[c], float(s[n]), float(d[n, c]))
         if hits and report.first_only:
@@ -269,9 +269,7 @@ class MotionJudge:
             report.clearance(dm[inside])
             hit = inside & (dm <= 0.0)
             touched = np.unique(at[hit])
-            bad = np.zeros(len(samples), dtype=bool)
-            bad[touched] = ~self._tolerated(line, samples[touched], exempt)
-            hit &= bad[at]
+            hit &= ~np.isin(at, touched[self._tolerated(line, samples[touched], exempt)])
             for row in np.flatnonzero(hit):
                 hits.note(pairs.solids[pair[row]], float(middle[row]), float(dm[row]))
             # A pair that collides is not searched any further here: its stretch is known to be bad.

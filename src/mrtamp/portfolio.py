@@ -42,6 +42,7 @@ _ROUNDS = 3
 _ALIKE = 0.02
 """Relative difference of cost below which two plans with the same order of events are held to be alike."""
 _EPS = 1e-9
+"""By how much the costs of a plan and of the polyline that it was made from may differ."""
 WORTH_CHECKING = 0.002
 """Relative gain over the incumbent that is worth a check."""
 
@@ -56,9 +57,7 @@ class _Entry:
     plan: Plan
     draft: bool = False
     estimate: float = np.nan
-    """What its skeleton was to cost, of a draft."""
-    of_draft: bool = False
-    """Whether it was one."""
+    """What its skeleton was to cost, if it began as a draft."""
     resolution: float = RESOLUTION
     refiner: Refiner | None = None
     optimiser: Optimiser | None = None
@@ -93,6 +92,24 @@ class _Entry:
     @property
     def on_trial(self) -> bool:
         return not self.done and (self.optimiser is None or self.optimiser.steps < _TRIAL)
+
+    @property
+    def fresh_draft(self) -> bool:
+        """Whether it began as a draft and has not converged yet."""
+        return self.rounds == 0 and bool(np.isfinite(self.estimate))
+
+    @property
+    def goes_ahead(self) -> bool:
+        """Whether, as the incumbent, it has its turns before others: a draft from its trial to the end of its second
+        round, where re-timing and finer steps gain most."""
+        begun = self.rounds == 1 or (self.rounds == 0 and not self.on_trial)
+        return begun and bool(np.isfinite(self.estimate))
+
+    def hopeless(self, incumbent: float, most: float) -> bool:
+        """Whether it is a draft to give up: its estimate is above `most`, where no draft so far has ended cheap enough,
+        or its trial left it no cheaper than the incumbent, and to come free costs it more still.
+        """
+        return self.draft and (self.estimate > most or (not self.on_trial and self.outlook >= incumbent))
 
 
 class Portfolio:
@@ -156,7 +173,7 @@ class Portfolio:
                 continue
             self._seen.add(round(plan.cost, 6))
             free = self.incumbent.accepted(draft.segments, draft.transitions) if draft.conflict == 0.0 else None
-            entry = _Entry(free or plan, draft=free is None, estimate=estimate, of_draft=True)
+            entry = _Entry(free or plan, draft=free is None, estimate=estimate)
             entry.optimiser = self._optimiser(entry)
             fresh.append(entry)
         self._admit(fresh[::-1])
@@ -168,8 +185,8 @@ class Portfolio:
         The cheapest of all stays.
         """
         self._entries += fresh
+        best = min(self._entries, key=lambda e: e.cost, default=None)
         while len(self._entries) > SIZE:
-            best = min(self._entries, key=lambda e: e.cost)
             others = [e for e in self._entries if e not in fresh and e is not best]
             going = [e for e in others if e.done] or [e for e in others if not e.draft] or others
             self._entries.remove(max(going, key=lambda e: e.cost))
@@ -177,7 +194,7 @@ class Portfolio:
     def improve(self, incumbent: float) -> Plan | None:
         """Give one plan its turn; a checked plan when it is clearly cheaper than `incumbent`."""
         entry = self._choose(incumbent)
-        self.drafted = entry is not None and np.isfinite(entry.estimate)
+        self.drafted = entry is not None and entry.fresh_draft
         if entry is None:
             return None
         if entry.optimiser is None:
@@ -204,27 +221,20 @@ class Portfolio:
         return all(e.done and (e.fruitless >= _ROUNDS or e.cost >= _HOPELESS * incumbent) for e in self._entries)
 
     def _choose(self, incumbent: float) -> _Entry | None:
-        """One that is about to beat the incumbent; else the incumbent itself, if a draft has become it, from its trial
-        to the end of its second round, where re-timing and finer steps gain most; else one on trial, the newest first;
-        else one that goes on.
+        """One that is about to beat the incumbent; else the incumbent itself if it `goes_ahead`; else one on trial, the
+        newest first; else one that goes on.
 
         What drafts seem to cost before their first program says nothing: those on trial begin with the most promising.
-        Drafts are given up once no draft so far has ended cheap enough for them to matter, or if they are no cheaper
-        than the incumbent after their trial: to come free of collision costs them more still.
+        Drafts that are `hopeless` are given up.
         """
-        most = self.worth_drafting(incumbent)
-        self._entries = [
-            e
-            for e in self._entries
-            if not (e.draft and ((self._share and e.estimate > most) or (not e.on_trial and e.outlook >= incumbent)))
-        ]
+        most = self.worth_drafting(incumbent) if self._share else np.inf
+        self._entries = [e for e in self._entries if not e.hopeless(incumbent, most)]
         near = [e for e in self._entries if e.trail and e.outlook < _NEARLY * incumbent]
         if near:
             return min(near, key=lambda e: e.outlook)
-        ahead = [e for e in self._entries if e.of_draft and e.cost <= incumbent + _EPS and e.rounds < 2]
-        ahead = [e for e in ahead if e.rounds or not e.on_trial]
-        if ahead:
-            return self._again(ahead[0]) if ahead[0].done else ahead[0]
+        ahead = next((e for e in self._entries if e.goes_ahead and e.cost <= incumbent + _EPS), None)
+        if ahead is not None:
+            return self._again(ahead) if ahead.done else ahead
         trial = [e for e in self._entries if e.on_trial]
         if trial:
             return trial[-1]
@@ -291,17 +301,16 @@ class Portfolio:
     def _finish(self, entry: _Entry) -> None:
         """Convergence: what was gained decides whether the plan is worth another round; a draft is given up."""
         work = entry.optimiser
-        if work is not None and np.isfinite(work.cost) and (entry.draft or work.cost < entry.plan.cost - 1e-9):
+        if work is not None and np.isfinite(work.cost) and (entry.draft or work.cost < entry.plan.cost - _EPS):
             plan = self.incumbent.accepted(work.segments(), work.transitions)
             if plan is not None:
                 entry.plan, entry.draft = plan, False
         if entry.draft:
             self._entries.remove(entry)
             return
-        if np.isfinite(entry.estimate):
+        if entry.fresh_draft:
             share = entry.plan.cost / entry.estimate
             self._share = min(self._share or share, share)
-            entry.estimate = np.nan
         gained = entry.before - entry.plan.cost > WORTH_CHECKING * entry.plan.cost
         entry.fruitless = 0 if gained else entry.fruitless + 1
         entry.rounds += 1

@@ -363,10 +363,12 @@ class ShortestPaths:
         return None
 
     def _free(self, edges: np.ndarray) -> np.ndarray:
-        known = len(self._blocked)
-        if self._roadmap.n_edges <= known:
+        known = edges < len(self._blocked)
+        if known.all():
             return ~self._blocked[edges]
-        return ~np.append(self._blocked, False)[np.minimum(edges, known)]
+        free = ~known
+        free[known] = ~self._blocked[edges[known]]
+        return free
 
 
 def prm_star_neighbours(n: int, dof: int) -> int:
