@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from mrtamp.options import Happening, Skeleton
-from mrtamp.realisation import _Drafted
+from mrtamp.realisation import _CHEAPER, _LIKE, _Drafted
 from mrtamp.skeleton_guidance import Proposal
-from mrtamp.skeletons import ALIKE
 from mrtamp.transitions.ways import Stop, Way
 
 ORDER = ((("red", 0, ("a", "b")), ("blue", 0, ("a", "b"))),)
@@ -20,6 +19,7 @@ def proposal(
     *,
     order: tuple = ORDER,
     turned: bool = False,
+    cost: float = 1.0,
     shortened: bool = True,
     robots: tuple[str, ...] = ("a", "b"),
 ) -> Proposal:
@@ -28,7 +28,7 @@ def proposal(
         for item, q in (("red", red), ("blue", blue))
     }
     happenings = tuple(Happening(item, 0, 0.0) for item in (reversed(ways) if turned else ways))
-    skeleton = Skeleton({item: (0, 0) for item in ways}, happenings, 1.0, 1.0, {}, order)
+    skeleton = Skeleton({item: (0, 0) for item in ways}, happenings, cost, 1.0, {}, order)
     stops = tuple((ways[h.task].stops[0], ways[h.task]) for h in happenings)
     return Proposal(skeleton, stops, ((), ()), 0)
 
@@ -37,9 +37,12 @@ def proposal(
     ("other", "known"),
     [
         (proposal([0.0, 0.0], [1.0, 1.0]), True),
-        (proposal([0.0, 0.9 * ALIKE], [1.0 - 0.9 * ALIKE, 1.0]), True),
-        (proposal([0.0, 0.0], [1.0, 1.0 + 1.1 * ALIKE]), False),
+        (proposal([0.0, 0.9 * _LIKE], [1.0 - 0.9 * _LIKE, 1.0]), True),
+        (proposal([0.0, 0.0], [1.0, 1.0 + 1.1 * _LIKE]), False),
         (proposal([1.0, 1.0], [0.0, 0.0]), False),
+        # What has become clearly cheaper is worth another draft.
+        (proposal([0.0, 0.0], [1.0, 1.0], cost=_CHEAPER + 0.01), True),
+        (proposal([0.0, 0.0], [1.0, 1.0], cost=_CHEAPER - 0.01), False),
         # Only when things happen is different, which the decoupled timing decides anew.
         (proposal([0.0, 0.0], [1.0, 1.0], turned=True), True),
         (proposal([0.0, 0.0], [1.0, 1.0], order=()), False),

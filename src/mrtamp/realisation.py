@@ -18,7 +18,6 @@ from mrtamp.optimise.yielding import Draft
 from mrtamp.plan import Plan, plan_cost
 from mrtamp.portfolio import Portfolio
 from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
-from mrtamp.skeletons import ALIKE
 from mrtamp.space_time import SpaceTime
 from mrtamp.tensor_tree import Node
 from mrtamp.transitions.ways import Way
@@ -49,6 +48,9 @@ _MENDINGS = 8
 """Times that a realisation is judged, steps to which the judge objected being forbidden before the next."""
 _MANY = 12
 """Stops from which on a realisation takes too long for that."""
+_LIKE, _CHEAPER = 0.5, 0.97
+"""Difference of every joint (rad) up to which handovers have the same optimum as drafted ones, unless they promise to
+cost so much less."""
 
 
 class Realisation:
@@ -92,6 +94,7 @@ class Realisation:
         self.undrafted = self.drafts
         self._turn = 0
         self._early = False
+        self._drafted = _Drafted()
 
     def attempt(self) -> Plan | Node | None:
         """Grow the sets of ways and realise the cheapest skeletons that may beat the incumbent, until one succeeds.
@@ -161,26 +164,22 @@ class Realisation:
             if self.descent is not None:
                 self.skeletons.shorten(self.descent, _FIRST_SHORTENED)
             return
-        self._more_ways()
-        if not self.undrafted:
-            return
-        cheapest = self._cheapest()
-        for _ in range(_GROWTHS - 1):
-            self._more_ways()
-            before, cheapest = cheapest, self._cheapest()
+        cheapest = np.inf
+        for _ in range(_GROWTHS if self.undrafted else 1):
+            before, cheapest = cheapest, self._more_ways()
             if cheapest > (1 - _WORTH_GROWING) * before:
                 break
 
-    def _more_ways(self) -> None:
+    def _more_ways(self) -> float:
+        """Sample ways and shorten them; what the cheapest skeleton promised to cost before its own became shorter."""
         self.skeletons.grow(*_MORE_WAYS)
         if self.descent is not None:
             self.skeletons.shorten(self.descent, _SHORTENED)
-            below = self.portfolio.worth_drafting(self.to_beat())
-            self.skeletons.shorten_proposed(self.descent, below, _THOROUGH, every=not self.undrafted)
-
-    def _cheapest(self) -> float:
-        """What the cheapest skeleton promises to cost."""
-        return min((p.skeleton.cost for p in self.skeletons.propose(effort=_THOROUGH)), default=np.inf)
+        below = self.portfolio.worth_drafting(self.to_beat())
+        proposals = list(self.skeletons.propose(below, _THOROUGH))
+        if self.descent is not None:
+            self.skeletons.shorten_proposed(self.descent, proposals, every=not self.undrafted)
+        return min((p.skeleton.cost for p in proposals), default=np.inf)
 
     @property
     def _first(self) -> bool:
@@ -197,13 +196,12 @@ class Realisation:
         if self._turn % 3 == 0:
             return False
         self.undrafted = False
-        drafted = _Drafted()
         drafts: list[tuple[float, Draft]] = []
         sketched = 0
         while sketched < _SKETCHED and len(drafts) < _DRAFTS:
             below = self.portfolio.worth_drafting(self.to_beat())
             found = self.skeletons.propose(below, _THOROUGH)
-            proposals = list(itertools.islice((p for p in found if not drafted.knows(p)), _AT_ONCE))
+            proposals = list(itertools.islice((p for p in found if not self._drafted.knows(p)), _AT_ONCE))
             if not proposals:
                 if not sketched:
                     # Nothing promises a gain, however it were realised.
@@ -213,7 +211,7 @@ class Realisation:
                 sketched += 1
                 draft = self._sketch(proposal)
                 if draft is not None:
-                    drafted.add(proposal)
+                    self._drafted.add(proposal)
                     drafts.append((proposal.skeleton.cost, draft))
         drafts.sort(key=lambda x: x[0] * (1 + _DETERRENT * x[1].conflict))
         return self.portfolio.add_drafts(drafts[:_DRAFTS]) > 0
@@ -254,26 +252,28 @@ class Realisation:
 
 
 class _Drafted:
-    """Skeletons with drafts of little conflict: others so much like them would be refined to the same plan."""
+    """Skeletons that had drafts of little conflict: others so much like them would be refined to the same plan."""
 
     def __init__(self) -> None:
-        self._stops: dict[tuple, list[np.ndarray]] = {}
+        self._known: dict[tuple, list[tuple[float, np.ndarray]]] = {}
 
     def add(self, proposal: Proposal) -> None:
         """Remember a skeleton."""
-        self._stops.setdefault(proposal.skeleton.order, []).append(self._flat(proposal))
+        known = self._known.setdefault(proposal.skeleton.order, [])
+        known.append((proposal.skeleton.cost, self._flat(proposal)))
 
     def knows(self, proposal: Proposal) -> bool:
-        """Whether the same robots did the same in the same order before, with every joint near to where it was.
+        """Whether the same robots did the same in the same order before, with every joint near to where it was, and for
+        hardly more than this promises to cost.
 
         Only of skeletons whose every way has a handover and was shortened: those near to each other have the same
         optimum. What differs little elsewhere differs in who is in whose way, and to try again has paid.
         """
         if not all(way.shortened and len(way.robots) > 1 for way in proposal.ways):
             return False
-        flat = self._flat(proposal)
-        known = self._stops.get(proposal.skeleton.order, [])
-        return any(np.abs(flat - other).max(initial=0.0) < ALIKE for other in known)
+        flat, cost = self._flat(proposal), proposal.skeleton.cost
+        known = self._known.get(proposal.skeleton.order, [])
+        return any(cost > _CHEAPER * c and np.abs(flat - other).max(initial=0.0) < _LIKE for c, other in known)
 
     @staticmethod
     def _flat(proposal: Proposal) -> np.ndarray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,7 @@ from mrtamp.problem import HeldBy, Problem, RobotAt
 from mrtamp.roadmap import lazy_path
 from mrtamp.schedule import FAR, Distance
 from mrtamp.skeletons import Event, Option, Skeleton, Task, lower_bound, skeletons
-from mrtamp.transitions.candidate import Candidate
+from mrtamp.transitions.candidate import Candidate, SolvedHandover
 from mrtamp.transitions.sampler import TransitionSampler
 from mrtamp.transitions.ways import Stop, Way, Ways
 
@@ -41,12 +41,10 @@ _TRIES = 4
 """Calls without result after which a set of ways is grown now and then only."""
 _ROUNDS = 200
 """Lazy searches for the length of one roadmap path."""
-_ADMITTED = 10
+_ADMITTED = 4
 """Shortened ways that are kept at a time, of different lengths."""
 _SLACK, _UNHURRIED = 0.5, 0.1
 """Time to spare (rad) from which on a motion hardly counts, and how much it still does."""
-_ALIKE = 0.02
-"""Largest difference of a joint (rad) between ways that are held to be alike."""
 _LIMIT = 12
 _MOST = 120
 """Ways per option that are handed to the search for skeletons."""
@@ -163,15 +161,15 @@ class SkeletonGuidance:
             for way in fresh:
                 way.shortened = True
             if fresh:
-                self._shorten(descent, item, fresh, known)
+                self._shorten(descent, item, fresh)
 
-    def shorten_proposed(self, descent: Descent, below: float, effort: int, *, every: bool) -> None:
-        """The same for the ways of the cheapest skeletons, between what their robots do before and after.
+    def shorten_proposed(self, descent: Descent, proposals: Sequence[Proposal], *, every: bool) -> None:
+        """The same for the ways of some skeletons, between what their robots do before and after.
 
         `every`: also for those without handovers.
         """
         groups: dict[tuple[str, tuple[str, ...]], list[tuple[Way, dict[str, Surroundings]]]] = {}
-        for proposal in self.propose(below, effort):
+        for proposal in proposals:
             for way, around in self._in_context(proposal):
                 gained = way.stops[0].after
                 if gained is not None and (every or len(way.robots) > 1):
@@ -184,7 +182,7 @@ class SkeletonGuidance:
                 )
                 for r in robots
             }
-            self._shorten(descent, item, [way for way, _ in found], self.ways.of[item, robots], around)
+            self._shorten(descent, item, [way for way, _ in found], around)
 
     def _in_context(self, proposal: Proposal) -> Iterator[tuple[Way, dict[str, Surroundings]]]:
         """The ways of a proposal with what their robots do before and after; what nobody waits for counts less."""
@@ -243,22 +241,13 @@ class SkeletonGuidance:
         descent: Descent,
         item: str,
         fresh: list[Way],
-        known: list[Way],
         around: Mapping[str, Surroundings] | None = None,
     ) -> None:
         bases = {body: self.sampler.validity.world_pose(chain) for body, chain in self._chains.items()}
         lengths, stages = descent.shorten(self.root, fresh, bases, item in self.ways.planned, around)
-        new: list[np.ndarray] = [_flat(w) for w in known if w.shortened]
-        enough = len(new) + _ADMITTED
-        for k in np.argsort(lengths, kind="stable").tolist():
-            flat = np.concatenate([x for q in stages[k][0].q for x in q.values()])
-            if any(np.abs(flat - other).max() < _ALIKE for other in new):
-                continue
-            slid = self.ways.admit(self.root, fresh[k], [(s.q, s.after) for s in stages[k]], self._chains)
-            if slid is not None:
-                new.append(_flat(slid))
-                if len(new) == enough:
-                    return
+        order = np.argsort(lengths, kind="stable").tolist()
+        slid = [[(s.q, s.after) for s in stages[k]] for k in order]
+        self.ways.admit(self.root, (item, fresh[0].robots), [fresh[k] for k in order], slid, self._chains, _ADMITTED)
 
     def _grow_carries(self, item: str, chains: Mapping[str, tuple[Attachment, ...]], n: int, keep: int) -> None:
         for robot in self.robots:
@@ -481,7 +470,7 @@ class SkeletonGuidance:
         sampler = self.sampler
         assert stop.before is not None and stop.after is not None
         if stop.kind == "handover":
-            return sampler.meet(mode, stop.before, stop.after, stop.q)
+            return sampler.meet(SolvedHandover(stop.before, stop.after, stop.q))
         picks = stop.kind == "pick"
         [robot] = stop.robots
         placement, grasp = (stop.before, stop.after) if picks else (stop.after, stop.before)
@@ -493,8 +482,3 @@ class SkeletonGuidance:
         stats.accepted += 1
         pick, place = sampler.register(robot, v, placement, grasp, base)
         return pick if picks else place
-
-
-def _flat(way: Way) -> np.ndarray:
-    """All configurations of a way, one after the other."""
-    return np.concatenate([x for stop in way.stops for x in stop.q.values()])

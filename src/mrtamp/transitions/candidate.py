@@ -41,6 +41,29 @@ StratumKey = tuple[str, tuple[str, ...], str, str]
 """Kind, robots, object, and the place it comes from (pick), goes to (place), the giver (handover) or the subgoal."""
 
 
+@dataclass(frozen=True, eq=False)
+class SolvedHandover:
+    """Where two robots stand, by IK, when an object goes from the grasp `given` into the grasp `taken`.
+
+    `q` maps both to their configurations, of which nothing else is known.  `promising` is as for candidates;
+    `leads_on`: whether it seems to be on a shortest way to the goal.  `retreats` maps the robots to configurations
+    along a straight retreat of the hand, once those are known.
+    """
+
+    given: Attachment
+    taken: Attachment
+    q: Mapping[str, np.ndarray]
+    promising: bool = True
+    leads_on: bool = True
+    retreats: Mapping[str, Sequence[np.ndarray]] | None = None
+
+    @property
+    def stratum(self) -> StratumKey:
+        """Under which its outcome is counted."""
+        giver, receiver = self.given.parent, self.taken.parent
+        return "handover", (giver, receiver), self.taken.object, giver
+
+
 @dataclass
 class Outcome:
     """What became of the samples of one stratum.

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from mrtamp.modes import Attachment, Mode
 from mrtamp.roadmap import Roadmap
-from mrtamp.transitions.candidate import Outcome
+from mrtamp.transitions.candidate import Outcome, SolvedHandover
 from mrtamp.transitions.workspace import Workspace
 
 APPROACH = (0.07, 0.15, 0.25)
@@ -106,17 +107,31 @@ class ContactBuilder:
         self, robot: str, q: np.ndarray, X_WG: np.ndarray, direction: np.ndarray, distances: Sequence[float]
     ) -> list[np.ndarray]:
         """Configurations along a straight retreat of the hand, as far as they continue q without a jump."""
-        targets = np.tile(X_WG, (len(distances), 1, 1))
-        targets[:, :3, 3] += np.outer(distances, direction)
-        found, solved = self.workspace.ik(robot, targets, np.tile(q, (len(distances), 1)))
-        out: list[np.ndarray] = []
-        last = q
-        for x, ok in zip(found, solved, strict=True):
-            if not ok or np.abs(x - last).max() > _CHAIN_JUMP:
-                break
-            out.append(x)
-            last = x
-        return out
+        return self._chains(robot, q[None], X_WG[None], direction[None], distances)[0]
+
+    def _chains(
+        self, robot: str, q: np.ndarray, X_WG: np.ndarray, direction: np.ndarray, distances: Sequence[float]
+    ) -> list[list[np.ndarray]]:
+        """The same for N configurations (N, n), hands (N, 4, 4) and directions (N, 3), by IK in one batch."""
+        n, k = len(q), len(distances)
+        targets = np.repeat(X_WG, k, axis=0)
+        targets[:, :3, 3] += (np.array(distances)[:, None] * direction[:, None]).reshape(-1, 3)
+        found, solved = self.workspace.ik(robot, targets, np.repeat(q, k, axis=0))
+        jumps = np.abs(np.diff(np.concatenate([q[:, None], found.reshape(n, k, -1)], axis=1), axis=1)).max(axis=2)
+        goes_on = np.cumprod(solved.reshape(n, k) & (jumps <= _CHAIN_JUMP), axis=1).sum(axis=1)
+        return [list(x[:m]) for x, m in zip(found.reshape(n, k, -1), goes_on.tolist(), strict=True)]
+
+    def with_retreats(self, handovers: Sequence[SolvedHandover]) -> list[SolvedHandover]:
+        """Handovers between the same two robots with their retreats, in one batch."""
+        if not handovers:
+            return []
+        retreats: list[dict[str, list[np.ndarray]]] = [{} for _ in handovers]
+        for robot in handovers[0].q:
+            q = np.array([h.q[robot] for h in handovers])
+            X_WG = self.roadmaps[robot].world.tool.matrix(q)
+            for own, chain in zip(retreats, self._chains(robot, q, X_WG, -X_WG[:, :3, 2], APPROACH[:2]), strict=True):
+                own[robot] = chain
+        return [replace(h, retreats=own) for h, own in zip(handovers, retreats, strict=True)]
 
     def _attach(
         self, roadmap: Roadmap, v: int, chain: Sequence[np.ndarray], contact: tuple[str, str] | None
@@ -131,18 +146,11 @@ class ContactBuilder:
             last = i
         return exits
 
-    def exchange(
-        self,
-        mode: Mode,
-        giver: str,
-        receiver: str,
-        given: Attachment,
-        taken: Attachment,
-        qa: np.ndarray,
-        qb: np.ndarray,
-        stats: Outcome,
-    ) -> dict[str, int] | None:
+    def exchange(self, handover: SolvedHandover, stats: Outcome) -> dict[str, int] | None:
         """Check a handover configuration before and after, and put both contact vertices on their roadmaps."""
+        given, taken = handover.given, handover.taken
+        giver, receiver = given.parent, taken.parent
+        qa, qb = handover.q[giver], handover.q[receiver]
         worlds = [self.roadmaps[r].world for r in (giver, receiver)]
         for world, q, grasp in ((worlds[0], qa, given), (worlds[1], qb, taken)):
             for held in (grasp, None):
@@ -167,27 +175,24 @@ class ContactBuilder:
         if not all(apart(qa[None], ha, qb[None], hb, widths) for ha, hb, widths in stages):
             stats.collisions["each other"] += 1
             return None
-        chains = []
-        for robot, q, world in ((giver, qa, worlds[0]), (receiver, qb, worlds[1])):
-            X_WG = world.tool.matrix(q[None])[0]
-            chain = self._chain(robot, q, X_WG, -X_WG[:3, 2], APPROACH[:2])
-            if not chain:
-                stats.collisions["no approach"] += 1
-                return None
-            chains.append((robot, q, chain))
+        retreats = handover.retreats or self.with_retreats([handover])[0].retreats
+        assert retreats is not None
+        if not retreats[giver] or not retreats[receiver]:
+            stats.collisions["no approach"] += 1
+            return None
         # The receiver comes in while the giver holds, the giver leaves while the receiver holds.
-        leave = np.linspace(qa, chains[0][2][0], _CHAIN_SAMPLES)
-        enter = np.linspace(qb, chains[1][2][0], _CHAIN_SAMPLES)
+        leave = np.linspace(qa, retreats[giver][0], _CHAIN_SAMPLES)
+        enter = np.linspace(qb, retreats[receiver][0], _CHAIN_SAMPLES)
         stay_a, stay_b = np.tile(qa, (_CHAIN_SAMPLES, 1)), np.tile(qb, (_CHAIN_SAMPLES, 1))
         clear = apart(stay_a, given, enter, None) and apart(leave, None, stay_b, taken)
         if not clear or any(w.first_hit(w.rows(x, None, {})) >= 0 for w, x in zip(worlds, (leave, enter), strict=True)):
             stats.collisions["no approach"] += 1
             return None
         at: dict[str, int] = {}
-        for robot, q, chain in chains:
+        for robot, q in ((giver, qa), (receiver, qb)):
             roadmap = self.roadmaps[robot]
             v = roadmap.add_vertex(q, connect=False)
-            roadmap.exits[v] = self._attach(roadmap, v, chain, None)
+            roadmap.exits[v] = self._attach(roadmap, v, retreats[robot], None)
             at[robot] = v
         return at
 

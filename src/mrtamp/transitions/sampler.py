@@ -16,7 +16,7 @@ from mrtamp.kinematics import inverse
 from mrtamp.modes import Attachment, Mode
 from mrtamp.problem import Problem
 from mrtamp.roadmap import Roadmap
-from mrtamp.transitions.candidate import Candidate, Outcome
+from mrtamp.transitions.candidate import Candidate, Outcome, SolvedHandover
 from mrtamp.transitions.contacts import ContactBuilder
 from mrtamp.transitions.estimates import Estimates
 from mrtamp.transitions.families import FixedFamily, placement_families
@@ -202,7 +202,18 @@ class TransitionSampler(Workspace):
     def sample_handover(
         self, mode: Mode, giver: str, receiver: str, n: int = 72, keep: int = 3, *, directly: bool = False
     ) -> list[Candidate]:
-        """Sample handovers of what `giver` holds to `receiver`; returns the new candidates.
+        """Sample handovers of what `giver` holds to `receiver`; returns the new candidates, up to `keep`.
+
+        `directly` is as for `solve_handovers`.
+        """
+        return self.exchange(self.solve_handovers(mode, giver, receiver, n, directly=directly), keep)
+
+    def solve_handovers(
+        self, mode: Mode, giver: str, receiver: str, n: int, *, directly: bool = False
+    ) -> list[SolvedHandover]:
+        """Up to n handovers of what `giver` holds to `receiver` that IK has solved, those to look at first in front.
+
+        Neither robot is known to be clear of the other.
 
         `directly`: mostly those from which the receiver can put the object down at its goal, however hard they are to
         find; else those from which it has to be handed on as well, where that seems the shorter way by now.
@@ -222,18 +233,34 @@ class TransitionSampler(Workspace):
         X_WG = np.repeat(X_WG, _SEEDS, axis=0)
         found, each = (x.reshape(len(qa), _SEEDS, -1) for x in self.ik(receiver, X_WG, self.seeds(receiver, X_WG, 0.6)))
         solved = np.asarray(each[:, :, 0].any(axis=1))
-        qb = found[np.arange(len(qa)), np.argmax(each[:, :, 0], axis=1)]
-        return self._exchanges(mode, giver, receiver, grasps, qa, qb, solved, keep, directly=directly)
+        stats.samples += len(qa)
+        stats.ik_solved += int(solved.sum())
+        for i in np.flatnonzero(~solved).tolist():
+            self.holds.note_exchange(grasp, grasps[i], False, _NOT_MET)
+        rows = np.flatnonzero(solved)
+        qa, qb, into = qa[rows], found[rows, np.argmax(each[rows, :, 0], axis=1)], [grasps[i] for i in rows.tolist()]
+        reward = self.look_ahead(mode, receiver, item, into, qb)
+        homes = [self.roadmaps[r].world.home for r in (giver, receiver)]
+        near = np.linalg.norm(qa - homes[0], axis=1) + np.linalg.norm(qb - homes[1], axis=1)
+        promising = np.isfinite(reward)
+        order = self.mixed_order(near + np.where(promising, reward, _NO_WAY_ON))
+        # Of those that are not on the shortest way to the goal, as far as that is known, a few are enough.
+        leads = self.meetings.leads_on(grasp, into, promising, directly=directly)
+        order = np.concatenate([order[leads[order]], order[~leads[order]][:2]])
+        return [
+            SolvedHandover(grasp, into[k], {giver: qa[k], receiver: qb[k]}, bool(promising[k]), bool(leads[k]))
+            for k in order.tolist()
+        ]
 
-    def meet(self, mode: Mode, given: Attachment, taken: Attachment, q: Mapping[str, np.ndarray]) -> Candidate | None:
-        """The handover from one grasp into another at configurations q; None where it collides."""
-        giver, receiver = given.parent, taken.parent
-        stats = self.outcome(("handover", (giver, receiver), taken.object, giver))
-        at = self.contacts.exchange(mode, giver, receiver, given, taken, q[giver], q[receiver], stats)
+    def meet(self, handover: SolvedHandover) -> Candidate | None:
+        """A solved handover as a candidate; None where it collides."""
+        at = self.contacts.exchange(handover, self.outcome(handover.stratum))
         if at is None:
             return None
-        candidate = Candidate("handover", (giver, receiver), at, given, taken)
-        self._handovers.setdefault((given, receiver), []).append(candidate)
+        given, taken = handover.given, handover.taken
+        robots = (given.parent, taken.parent)
+        candidate = Candidate("handover", robots, at, given, taken, promising=handover.promising)
+        self._handovers.setdefault((given, taken.parent), []).append(candidate)
         return candidate
 
     def _received(self, giver: str, grasp: Attachment, qa: np.ndarray, grasps: Sequence[Attachment]) -> np.ndarray:
@@ -241,46 +268,17 @@ class TransitionSampler(Workspace):
         X_WO = self.roadmaps[giver].world.tool.matrix(qa) @ grasp.X_PO
         return X_WO @ inverse(np.array([g.X_PO for g in grasps]))
 
-    def _exchanges(
-        self,
-        mode: Mode,
-        giver: str,
-        receiver: str,
-        grasps: Sequence[Attachment],
-        qa: np.ndarray,
-        qb: np.ndarray,
-        solved: np.ndarray,
-        keep: int,
-        *,
-        directly: bool,
-    ) -> list[Candidate]:
+    def exchange(self, solved: Sequence[SolvedHandover], keep: int) -> list[Candidate]:
         """Candidates of those solved handovers that are free of collision, up to `keep`."""
-        grasp = mode.held[giver]
-        item = grasp.object
-        stats = self.outcome(("handover", (giver, receiver), item, giver))
-        stats.samples += len(qa)
-        stats.ik_solved += int(solved.sum())
-        rows = np.flatnonzero(solved)
-        into = [grasps[i] for i in rows.tolist()]
-        reward = self.look_ahead(mode, receiver, item, into, qb[rows])
-        homes = [self.roadmaps[r].world.home for r in (giver, receiver)]
-        near = np.linalg.norm(qa[rows] - homes[0], axis=1) + np.linalg.norm(qb[rows] - homes[1], axis=1)
-        for i in np.flatnonzero(~solved).tolist():
-            self.holds.note_exchange(grasp, grasps[i], False, _NOT_MET)
         out: list[Candidate] = []
-        promising = np.isfinite(reward)
-        order = self.mixed_order(near + np.where(promising, reward, _NO_WAY_ON))
-        # Of those that are not on the shortest way to the goal, as far as that is known, a few are enough.
-        leads = self.meetings.leads_on(grasp, into, promising, directly=directly)
-        order = np.concatenate([order[leads[order]][: 4 * keep], order[~leads[order]][:2]])
-        for k in order.tolist():
-            at = self.contacts.exchange(mode, giver, receiver, grasp, into[k], qa[rows[k]], qb[rows[k]], stats)
-            self.holds.note_exchange(grasp, into[k], at is not None, _EXCHANGED)
-            if at is not None:
-                candidate = Candidate("handover", (giver, receiver), at, grasp, into[k], promising=bool(promising[k]))
-                self._handovers.setdefault((grasp, receiver), []).append(candidate)
+        leading = [h for h in solved if h.leads_on]
+        looked_at = [*leading[: 4 * keep], *(h for h in solved if not h.leads_on)]
+        for handover in self.contacts.with_retreats(looked_at):
+            candidate = self.meet(handover)
+            self.holds.note_exchange(handover.given, handover.taken, candidate is not None, _EXCHANGED)
+            if candidate is not None:
                 out.append(candidate)
-                stats.accepted += 1
+                self.outcome(handover.stratum).accepted += 1
                 if len(out) == keep:
                     break
         return out

@@ -16,7 +16,7 @@ import numpy as np
 from mrtamp.kinematics import inverse
 from mrtamp.modes import Attachment, Mode
 from mrtamp.problem import Support
-from mrtamp.transitions.candidate import Candidate
+from mrtamp.transitions.candidate import Candidate, SolvedHandover
 from mrtamp.transitions.families import FixedFamily, PlacementFamily, placement_families
 from mrtamp.transitions.sampler import TransitionSampler
 
@@ -28,6 +28,8 @@ _CHECKED = 0.6
 """Share of the solved ways, shortest first for the most part, that are checked for collisions."""
 BLOCKED = 1.5
 """Added to the estimated cost of a way (rad) per resting object that stands in its way where things are now."""
+_ALIKE = 0.02
+"""Largest difference of a joint (rad) between ways that are held to be alike."""
 
 
 @dataclass(eq=False)
@@ -64,6 +66,10 @@ class Way:
     def robots(self) -> tuple[str, ...]:
         """Who takes part, in the order in which they do."""
         return tuple(dict.fromkeys(r for stop in self.stops for r in stop.robots))
+
+
+Slid = tuple[Sequence[Mapping[str, np.ndarray]], Sequence[Attachment]]
+"""What a way has become: for every stop the configurations of its robots, and what is attached after it."""
 
 
 class _Place(NamedTuple):
@@ -253,33 +259,55 @@ class Ways:
     def admit(
         self,
         mode: Mode,
-        way: Way,
-        stages: Sequence[tuple[Sequence[Mapping[str, np.ndarray]], Sequence[Attachment]]],
+        key: tuple[str, tuple[str, ...]],
+        ways: Sequence[Way],
+        stages: Sequence[Sequence[Slid]],
         chains: Mapping[str, tuple[Attachment, ...]],
-    ) -> Way | None:
-        """A way made from another by sliding its stops along their strata; None where none of them is free to be used.
+        most: int,
+    ) -> None:
+        """Add up to `most` ways to a set that were made from others by sliding their stops along their strata.
 
-        `stages` are such ways, the best first: for every stop the configurations of its robots, and what is attached
-        after it.  The first one free of collision is kept.
+        Of each of the `ways`, the most welcome first, `stages` are what it has become, the best first; the first one
+        free of collision is kept.  Those like another one that was shortened are left out.
         """
-        item = way.stops[0].after
-        assert item is not None
-        for q, after in stages:
-            found = self._slid(mode, way, q, after, chains)
-            if found is not None:
-                self.of.setdefault((item.object, way.robots), []).append(found)
-                return found
-        return None
+        known = self.of.setdefault(key, [])
+        shortened = [_flat([s.q for s in w.stops]) for w in known if w.shortened]
+        enough = len(shortened) + most
+        handovers = [self._handovers(way, found[0]) for way, found in zip(ways, stages, strict=True)]
+        for way, found, first in zip(ways, stages, self._with_retreats(handovers), strict=True):
+            flat = _flat(found[0][0])
+            if any(np.abs(flat - other).max() < _ALIKE for other in shortened):
+                continue
+            slid = (self._slid(mode, way, stage, chains, first if stage is found[0] else None) for stage in found)
+            free = next((s for s in slid if s is not None), None)
+            if free is not None:
+                known.append(free)
+                shortened.append(_flat([s.q for s in free.stops]))
+                if len(shortened) == enough:
+                    return
+
+    def _handovers(self, way: Way, stage: Slid) -> dict[int, SolvedHandover]:
+        """The handovers of a way, by the numbers of its stops, once its stops have slid."""
+        q, after = stage
+        return {
+            k: SolvedHandover(after[k - 1], after[k], q[k]) for k, s in enumerate(way.stops) if s.kind == "handover"
+        }
+
+    def _with_retreats(self, handovers: Sequence[dict[int, SolvedHandover]]) -> list[dict[int, SolvedHandover]]:
+        """The handovers of ways with the same kinds of stops, each number's retreats in one batch."""
+        found = {k: self.sampler.contacts.with_retreats([h[k] for h in handovers]) for k in (handovers or [{}])[0]}
+        return [{k: found[k][i] for k in found} for i in range(len(handovers))]
 
     def _slid(
         self,
         mode: Mode,
         way: Way,
-        q: Sequence[Mapping[str, np.ndarray]],
-        after: Sequence[Attachment],
+        stage: Slid,
         chains: Mapping[str, tuple[Attachment, ...]],
+        handovers: dict[int, SolvedHandover] | None,
     ) -> Way | None:
-        sampler = self.sampler
+        """A way as it has become, its handovers as far as they are known; None where it collides."""
+        q, after = stage
         first, last = way.stops[0].robots[0], way.stops[-1].robots[-1]
         placement, grasp = after[-1], after[-2]
         base = chains.get(placement.parent, ())
@@ -287,17 +315,12 @@ class Ways:
         penalty += self._place_free(mode, last, grasp, placement, base, q[-1][last])
         if not np.isfinite(penalty):
             return None
+        handovers = self._handovers(way, stage) if handovers is None else handovers
+        candidates = {k: self.sampler.meet(h) for k, h in handovers.items()}
+        if None in candidates.values():
+            return None
         before = [way.stops[0].before, *after[:-1]]
-        stops = []
-        for k, stop in enumerate(way.stops):
-            candidate = None
-            if stop.kind == "handover":
-                given = before[k]
-                assert given is not None
-                candidate = sampler.meet(mode, given, after[k], q[k])
-                if candidate is None:
-                    return None
-            stops.append(Stop(stop.kind, stop.robots, before[k], after[k], q[k], candidate))
+        stops = (Stop(s.kind, s.robots, before[k], after[k], q[k], candidates.get(k)) for k, s in enumerate(way.stops))
         return Way(tuple(stops), BLOCKED * penalty, shortened=True)
 
     def _keep(self, key: tuple[str, tuple[str, ...]], ways: list[Way], most: int = 160) -> None:
@@ -413,3 +436,8 @@ class Ways:
         if not others or world.first_hit(rows, after.parent, slot) < 0:
             return 0.0
         return float(len({x for pair in world.culprits(rows[0], after.parent, slot) for x in pair if x in others}))
+
+
+def _flat(q: Sequence[Mapping[str, np.ndarray]]) -> np.ndarray:
+    """All configurations of a way, one after the other."""
+    return np.concatenate([x for stop in q for x in stop.values()])
