@@ -296,6 +296,7 @@ class Portfolio:
             draft=entry.draft,
             # Finer steps beside bends gain little: they wait until a plan has proved itself.
             levels=entry.rounds,
+            level=min(entry.rounds, 1),
         )
 
     def _finish(self, entry: _Entry) -> None:

@@ -74,6 +74,7 @@ class Optimiser:
     families : (robot, object) -> grasp families within which grasps may slide.
     knot : length (rad) of the steps of the polyline.
     levels : how often steps beside bends are halved, each time the one before has converged.
+    level : how often they are halved from the start.
     slide : whether transitions may slide along their strata; otherwise their configurations stay as they are.
     draft : whether robots may still collide with each other in what is given.
 
@@ -95,6 +96,7 @@ class Optimiser:
         *,
         knot: float = 0.27,
         levels: int = LEVELS,
+        level: int = 0,
         slide: bool = True,
         draft: bool = False,
     ) -> None:
@@ -117,6 +119,7 @@ class Optimiser:
         self._worth = np.inf
         self._promise = 0.0
         self.collisions = Collisions(self.nearness, problem.collision.tolerance)
+        self.collisions.level = level
         self._changes = self.weights.of_changes(a.kind for t in transitions for a in t.actions)
         self.choices = Choices(problem, [s.mode for s in segments], transitions, families if slide else {})
         if not slide:
