@@ -10,9 +10,11 @@ from arena import XY, arena, visit
 from discs import Errands
 
 from mrtamp.check import check_plan
+from mrtamp.options import Skeleton
 from mrtamp.plan import Plan
 from mrtamp.planner import Options, Planner
 from mrtamp.portfolio import SIZE
+from mrtamp.skeleton_guidance import Proposal
 
 STARTS: Mapping[str, XY] = {"a": (-1, 1), "b": (-1, -1)}
 
@@ -107,3 +109,28 @@ def test_drafts_that_are_free_count_as_plans_and_make_room_for_themselves(tmp_pa
     assert not any(e.draft for e in portfolio._entries)
     best = portfolio.improve(plans[0].cost)
     assert best is None or check_plan(best).ok
+
+
+def test_a_plan_is_shortened_before_it_is_shown_unless_the_judge_objects(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planner = planner_for(tmp_path)
+    plan = roundabout(planner, 0.6)
+    shortened = planner.portfolio.shortened(plan, 40)
+    assert shortened.cost < 0.9 * plan.cost
+    assert check_plan(shortened).ok
+    assert planner.portfolio.shortened(plan, 0) is plan, "nothing was tried"
+    monkeypatch.setattr(planner.incumbent, "accepted", lambda *_: None)
+    assert planner.portfolio.shortened(plan, 40) is plan
+
+
+@pytest.mark.parametrize(("promised", "shortened"), [(0.9, False), (0.4, True)])
+def test_only_a_first_plan_that_is_far_dearer_than_promised_has_to_wait(
+    tmp_path: Path, promised: float, shortened: bool
+) -> None:
+    planner = planner_for(tmp_path)
+    plan = roundabout(planner, 0.6)
+    proposal = Proposal(Skeleton({}, (), promised * plan.cost, 0.0, {}, ()), (), (), 0)
+    assert (planner.realisation._shown_first(plan, proposal) is plan) is not shortened
+    planner.realisation.shortening = False
+    assert planner.realisation._shown_first(plan, proposal) is plan

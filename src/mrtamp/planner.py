@@ -161,6 +161,7 @@ class Planner:
             self._to_beat,
             descent=Descent(self.sampler, self.portfolio.nearness) if self._uses("way-descent") else None,
             drafts=self._uses("drafts"),
+            shortening=self._uses("refinement"),
         )
         self._effort = Effort(
             {"search": 0.05, "skeletons": 0.25, "refinement": 0.1},

@@ -152,6 +152,13 @@ class Portfolio:
         self._admit([_Entry(plan)])
         return True
 
+    def shortened(self, plan: Plan, proposals: int) -> Plan:
+        """A checked plan after so many shortcuts were tried on it; the same one if the judge objects to the outcome."""
+        work = Refiner(plan, self.validity, self.rng, RESOLUTION)
+        if not work.improve(proposals):
+            return plan
+        return self.incumbent.accepted(work.segments(), work.transitions) or plan
+
     def worth_drafting(self, incumbent: float) -> float:
         """Estimate below which drafts may come to beat the incumbent, from what became of those so far."""
         return _NEARLY * incumbent / (_LUCK * self._share) if self._share else incumbent

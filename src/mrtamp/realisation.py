@@ -44,6 +44,8 @@ _DETERRENT = 100.0
 """By how many times dearer a skeleton seems for a conflict of 1 in its draft."""
 _POOR = 2.0
 """A first realisation that costs so many times what its skeleton promised is not the only one."""
+_DEAR, _SHORTCUTS = 2.1, 40
+"""If the best of them still costs so many times that, so many shortcuts are tried on it before it counts as a plan."""
 _MENDINGS = 8
 """Times that a realisation is judged, steps to which the judge objected being forbidden before the next."""
 _MANY = 12
@@ -65,6 +67,7 @@ class Realisation:
     to_beat : cost that a skeleton has to promise less than.
     descent : shortens ways along their strata; None: they stay as they were sampled.
     drafts : whether skeletons are also put under refinement as they are.
+    shortening : whether a dear first plan is shortened before it counts.
 
     Attributes
     ----------
@@ -82,6 +85,7 @@ class Realisation:
         *,
         descent: Descent | None = None,
         drafts: bool = True,
+        shortening: bool = True,
     ) -> None:
         self.growth = growth
         self.skeletons = skeletons
@@ -91,6 +95,7 @@ class Realisation:
         self.to_beat = to_beat
         self.descent = descent
         self.drafts = drafts and portfolio.convex
+        self.shortening = shortening
         self.undrafted = self.drafts
         self._turn = 0
         self._early = False
@@ -135,11 +140,16 @@ class Realisation:
                 plan = self._judged(timed, schedule, proposal)
                 if plan is not None:
                     self.skeletons.realised(proposal)
-                    return plan
+                    return self._shown_first(plan, proposal) if first else plan
                 failed |= self.skeletons.refused(proposal)
             if not failed:
                 return None
         return None
+
+    def _shown_first(self, plan: Plan, proposal: Proposal) -> Plan:
+        """The first plan, shortened a little where it is far dearer than its skeleton promised and that is quick."""
+        dear = plan.cost > _DEAR * proposal.skeleton.cost and len(proposal.stops) <= _MANY
+        return self.portfolio.shortened(plan, _SHORTCUTS) if dear and self.shortening else plan
 
     def _judged(self, timed: Timed | None, schedule: SpaceTime | None, proposal: Proposal) -> Plan | None:
         """The plan of a realisation if the judge accepts it, after some attempts without the steps it objected to."""
