@@ -188,7 +188,7 @@ class Realisation:
         below = self.portfolio.worth_drafting(self.to_beat())
         proposals = list(self.skeletons.propose(below, _THOROUGH))
         if self.descent is not None:
-            self.skeletons.shorten_proposed(self.descent, proposals, every=not self.undrafted)
+            self.skeletons.shorten_proposed(self.descent, proposals)
         return min((p.skeleton.cost for p in proposals), default=np.inf)
 
     @property

@@ -163,16 +163,13 @@ class SkeletonGuidance:
             if fresh:
                 self._shorten(descent, item, fresh)
 
-    def shorten_proposed(self, descent: Descent, proposals: Sequence[Proposal], *, every: bool) -> None:
-        """The same for the ways of some skeletons, between what their robots do before and after.
-
-        `every`: also for those without handovers.
-        """
+    def shorten_proposed(self, descent: Descent, proposals: Sequence[Proposal]) -> None:
+        """The same for the handovers of some skeletons, between what their robots do before and after."""
         groups: dict[tuple[str, tuple[str, ...]], list[tuple[Way, dict[str, Surroundings]]]] = {}
         for proposal in proposals:
             for way, around in self._in_context(proposal):
                 gained = way.stops[0].after
-                if gained is not None and (every or len(way.robots) > 1):
+                if gained is not None and len(way.robots) > 1:
                     groups.setdefault((gained.object, way.robots), []).append((way, around))
         for (item, robots), found in groups.items():
             self.deadline.check()

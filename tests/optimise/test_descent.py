@@ -198,7 +198,7 @@ def test_skeletons_get_cheaper_by_it_and_it_can_be_switched_off() -> None:
     descent = Descent(planner.sampler, planner.portfolio.nearness)
     planner.skeletons.shorten(descent, 20)
     alone = min(p.skeleton.cost for p in planner.skeletons.propose())
-    planner.skeletons.shorten_proposed(descent, list(planner.skeletons.propose(effort=100)), every=True)
+    planner.skeletons.shorten_proposed(descent, list(planner.skeletons.propose(effort=100)))
     together = min(p.skeleton.cost for p in planner.skeletons.propose())
     assert alone < 0.9 * before and together < alone
 
