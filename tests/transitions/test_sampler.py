@@ -12,6 +12,7 @@ from mrtamp.kinematics import inverse
 from mrtamp.modes import Attachment, Mode
 from mrtamp.planner import Options, Planner
 from mrtamp.problem_file import problem_from_dict
+from mrtamp.transitions.contacts import APPROACH
 from mrtamp.transitions.families import Family, residual
 from mrtamp.transitions.projection import solve_ik, uniform_configurations
 
@@ -146,6 +147,26 @@ def test_handovers_use_many_grasps_of_the_receiver(planner: Planner) -> None:
     for c in found:
         X = {r: tools[r].matrix(planner.roadmaps[r].q[[v]])[0] for r, v in c.at.items()}
         np.testing.assert_allclose(X["left"] @ c.before.X_PO, X["right"] @ c.after.X_PO, atol=1e-6)
+
+
+def test_retreats_go_straight_back_whether_alone_or_many_at_once(planner: Planner) -> None:
+    mode, sampler = holding(planner, "left", "bar"), planner.sampler
+    solved = [h for _ in range(4) for h in sampler.solve_handovers(mode, "left", "right", 48)]
+    assert len(solved) >= 8
+    lengths = set()
+    for handover, one_of_many in zip(solved, sampler.contacts.with_retreats(solved), strict=True):
+        [alone] = sampler.contacts.with_retreats([handover])
+        assert one_of_many.retreats is not None and alone.retreats is not None
+        for robot, q in handover.q.items():
+            many, one = one_of_many.retreats[robot], alone.retreats[robot]
+            assert len(many) == len(one)
+            lengths.add(len(one))
+            X_WG = sampler.roadmaps[robot].world.tool.matrix(np.array([q, *one]))
+            for k, x in enumerate(one):
+                np.testing.assert_allclose(many[k], x, atol=1e-6)
+                expected = X_WG[0, :3, 3] - APPROACH[k] * X_WG[0, :3, 2]
+                np.testing.assert_allclose(X_WG[k + 1, :3, 3], expected, atol=1e-6)
+    assert lengths >= {0, 2} or lengths >= {1, 2}, "some arms cannot follow all the way"
 
 
 def full_plant_depth(
