@@ -94,16 +94,20 @@ class _Entry:
         return not self.done and (self.optimiser is None or self.optimiser.steps < _TRIAL)
 
     @property
+    def began_as_draft(self) -> bool:
+        return bool(np.isfinite(self.estimate))
+
+    @property
     def fresh_draft(self) -> bool:
         """Whether it began as a draft and has not converged yet."""
-        return self.rounds == 0 and bool(np.isfinite(self.estimate))
+        return self.rounds == 0 and self.began_as_draft
 
     @property
     def goes_ahead(self) -> bool:
         """Whether, as the incumbent, it has its turns before others: a draft from its trial to the end of its second
         round, where re-timing and finer steps gain most."""
         begun = self.rounds == 1 or (self.rounds == 0 and not self.on_trial)
-        return begun and bool(np.isfinite(self.estimate))
+        return begun and self.began_as_draft
 
     def hopeless(self, incumbent: float, most: float) -> bool:
         """Whether it is a draft to give up: its estimate is above `most`, where no draft so far has ended cheap enough,

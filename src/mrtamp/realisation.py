@@ -185,6 +185,9 @@ class Realisation:
         self.skeletons.grow(*_MORE_WAYS)
         if self.descent is not None:
             self.skeletons.shorten(self.descent, _SHORTENED)
+        if not self.undrafted and (self.descent is None or not self.skeletons.hands_over):
+            # Nobody asks.
+            return np.inf
         below = self.portfolio.worth_drafting(self.to_beat())
         proposals = list(self.skeletons.propose(below, _THOROUGH))
         if self.descent is not None:
@@ -268,22 +271,28 @@ class _Drafted:
         self._known: dict[tuple, list[tuple[float, np.ndarray]]] = {}
 
     def add(self, proposal: Proposal) -> None:
-        """Remember a skeleton."""
-        known = self._known.setdefault(proposal.skeleton.order, [])
-        known.append((proposal.skeleton.cost, self._flat(proposal)))
+        """Remember a skeleton, if others may be compared with it."""
+        if self._comparable(proposal):
+            known = self._known.setdefault(proposal.skeleton.order, [])
+            known.append((proposal.skeleton.cost, self._flat(proposal)))
 
     def knows(self, proposal: Proposal) -> bool:
         """Whether the same robots did the same in the same order before, with every joint near to where it was, and for
         hardly more than this promises to cost.
-
-        Only of skeletons whose every way has a handover and was shortened: those near to each other have the same
-        optimum. What differs little elsewhere differs in who is in whose way, and to try again has paid.
         """
-        if not all(way.shortened and len(way.robots) > 1 for way in proposal.ways):
+        if not self._comparable(proposal):
             return False
         flat, cost = self._flat(proposal), proposal.skeleton.cost
         known = self._known.get(proposal.skeleton.order, [])
         return any(cost > _CHEAPER * c and np.abs(flat - other).max(initial=0.0) < _LIKE for c, other in known)
+
+    @staticmethod
+    def _comparable(proposal: Proposal) -> bool:
+        """Whether every way has a handover and was shortened: near to each other, such skeletons have the same optimum.
+
+        What differs little elsewhere differs in who is in whose way, and to try again has paid.
+        """
+        return all(way.shortened and len(way.robots) > 1 for way in proposal.ways)
 
     @staticmethod
     def _flat(proposal: Proposal) -> np.ndarray:

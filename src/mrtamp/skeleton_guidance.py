@@ -143,6 +143,11 @@ class SkeletonGuidance:
         for subgoal in self.problem.subgoals:
             self.sampler.reaching.sample(self.root, subgoal, n, keep)
 
+    @property
+    def hands_over(self) -> bool:
+        """Whether there are ways with handovers."""
+        return any(len(robots) > 1 and known for (_, robots), known in self.ways.of.items())
+
     def shorten(self, descent: Descent, most: int) -> None:
         """Let up to `most` of the shortest ways of every set with handovers slide along their strata to become shorter.
 

@@ -28,7 +28,7 @@ _EXACT_TASKS = 8
 """Up to so many tasks dynamic programming over subsets is used."""
 _PARTITIONS = 100_000
 _EPS = 1e-9
-ALIKE = 0.25
+_ALIKE = 0.25
 """Largest difference of a joint (rad or m) between candidates from which refinement comes to the same, most likely."""
 
 
@@ -238,5 +238,5 @@ def _near(option: Option, used: list[int]) -> np.ndarray:
     near = itself.copy()
     q = np.concatenate([x for event in option.events for x in event.stops.values()], axis=1)
     for m in used:
-        near |= np.abs(q - q[m]).max(axis=1) < ALIKE
+        near |= np.abs(q - q[m]).max(axis=1) < _ALIKE
     return itself if near.all() else near

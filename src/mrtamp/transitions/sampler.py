@@ -206,7 +206,7 @@ class TransitionSampler(Workspace):
 
         `directly` is as for `solve_handovers`.
         """
-        return self.exchange(self.solve_handovers(mode, giver, receiver, n, directly=directly), keep)
+        return self._exchange(self.solve_handovers(mode, giver, receiver, n, directly=directly), keep)
 
     def solve_handovers(
         self, mode: Mode, giver: str, receiver: str, n: int, *, directly: bool = False
@@ -268,7 +268,7 @@ class TransitionSampler(Workspace):
         X_WO = self.roadmaps[giver].world.tool.matrix(qa) @ grasp.X_PO
         return X_WO @ inverse(np.array([g.X_PO for g in grasps]))
 
-    def exchange(self, solved: Sequence[SolvedHandover], keep: int) -> list[Candidate]:
+    def _exchange(self, solved: Sequence[SolvedHandover], keep: int) -> list[Candidate]:
         """Candidates of those solved handovers that are free of collision, up to `keep`."""
         out: list[Candidate] = []
         leading = [h for h in solved if h.leads_on]
