@@ -169,9 +169,8 @@ def test_who_steps_aside_goes_where_the_roadmap_has_a_way(tmp_path: Path, monkey
     connector = skeleton.insertion.steering.connector
     sought: list[tuple[str, int]] = []
 
-    def connect(roadmap: Roadmap, mode: Mode, a: int, b: int, *_: object) -> bool:
+    def connect(roadmap: Roadmap, mode: Mode, a: int, b: int, *_: object) -> None:
         sought.append((roadmap.name, b))
-        return False
 
     monkeypatch.setattr(connector, "connect", connect)
     for _ in range(5):

@@ -32,6 +32,28 @@ _ASIDE = 6
 _ORDERS = 6
 """Orders that are tried in which robots go to their goals in the end."""
 
+
+@dataclass(frozen=True)
+class _Effort:
+    """How hard a next stop is tried.
+
+    depth : how many robots may have to move for one another in a chain.
+    around : whether to look for ways past robots that stand in the way, too.
+    anywhere : whether these may go anywhere; most of the many such places are no better than those that they have a
+        reason to go to.
+    """
+
+    depth: int
+    around: bool = False
+    anywhere: bool = False
+
+
+_EFFORTS = (
+    *(_Effort(depth) for depth in range(_DEPTH + 1)),
+    _Effort(0, around=True),
+    *(_Effort(depth, anywhere=True) for depth in range(1, _DEPTH + 1)),
+)
+
 Stand = Callable[[int, Mode], Candidate | None]
 """Number of a stop, mode -> its transition there; None while something is in its way."""
 
@@ -53,8 +75,9 @@ class _State:
 class Insertion:
     """Builds timed plans for skeletons.
 
-    Each robot's stops keep their order; among robots, the stop that can happen soonest happens next, and only where
-    none can, robots step aside for one another.  What attempts learn about moves is kept for later ones.
+    Each robot's stops keep their order; among robots, the stop that can happen soonest happens next, or else the most
+    urgent one, and only where none can, robots step aside for one another.  What attempts learn about moves is kept for
+    later ones.
 
     Attributes
     ----------
@@ -81,6 +104,7 @@ class Insertion:
         # Of one attempt: the transitions at its stops as far as they were asked for, and its `variety`.
         self._known: dict[tuple[int, Mode], Candidate | None] = {}
         self._variety = 0.0
+        self._effort = _EFFORTS[-1]
 
     def realise(
         self,
@@ -93,6 +117,7 @@ class Insertion:
         variety: float = 0.0,
         *,
         alone: bool = False,
+        latest: Sequence[float] | None = None,
     ) -> tuple[list[Segment], list[Transition]] | None:
         """Motions that bring about the stops and end at the goal vertices, or None.
 
@@ -106,6 +131,8 @@ class Insertion:
         variety : how often (0 to 1) a stop that can happen next does so although another could happen sooner, and a
             leg takes another way than the shortest.
         alone : robots keep clear of all but each other: a draft, as cheap as the skeleton promises where it is free.
+        latest : when each stop has to happen at the latest: the most urgent one that can happen next does, instead of
+            the soonest.
 
         Raises
         ------
@@ -121,21 +148,10 @@ class Insertion:
         while state.pending:
             ready = self._ready(state, robots, before)
             targets = self._targets(state, robots, goal)
-            after = None
-            soonest = self._soonest(state, ready, stand)
-            for depth in range(_DEPTH + 1):
-                done: list[_State] = []
-                for k in sorted(ready, key=lambda k: soonest[k]):
-                    if done and variety == 0.0 and min(x.time.events[-1] for x in done) <= soonest[k]:
-                        break
-                    trial = self._happen(state, k, stand, targets, depth)
-                    if trial is not None:
-                        done.append(trial)
-                if done:
-                    after = min(done, key=lambda x: x.time.events[-1])
-                    if self.rng.random() < variety:
-                        after = done[int(self.rng.integers(len(done)))]
-                    break
+            if latest is None:
+                after = self._soonest_next(state, ready, stand, targets)
+            else:
+                after = self._most_urgent_next(state, ready, stand, targets, latest)
             if after is None:
                 self.stuck = ready[0] if ready else state.pending[0]
                 return None
@@ -146,6 +162,40 @@ class Insertion:
             return None
         self.schedule = home.time
         return home.time.segments(), list(state.transitions)
+
+    def _soonest_next(
+        self, state: _State, ready: Sequence[int], stand: Stand, targets: Mapping[str, int]
+    ) -> _State | None:
+        """The schedule in which that of the stops happens next that can happen soonest; None: none can."""
+        soonest = self._soonest(state, ready, stand)
+        for self._effort in _EFFORTS:
+            done: list[_State] = []
+            for k in sorted(ready, key=lambda k: soonest[k]):
+                if done and self._variety == 0.0 and min(x.time.events[-1] for x in done) <= soonest[k]:
+                    break
+                trial = self._happen(state, k, stand, targets, self._effort.depth)
+                if trial is not None:
+                    done.append(trial)
+            if done and self.rng.random() < self._variety:
+                return done[int(self.rng.integers(len(done)))]
+            if done:
+                return min(done, key=lambda x: x.time.events[-1])
+        return None
+
+    def _most_urgent_next(
+        self, state: _State, ready: Sequence[int], stand: Stand, targets: Mapping[str, int], latest: Sequence[float]
+    ) -> _State | None:
+        """The schedule in which the most urgent of the stops happens next, others moved out of its way; None: none can.
+
+        What others do so as not to be in the way comes before places that are only one of many.
+        """
+        for efforts in (_EFFORTS[: _DEPTH + 1], _EFFORTS[_DEPTH + 1 :]):
+            for k in sorted(ready, key=lambda k: latest[k]):
+                for self._effort in efforts:
+                    done = self._happen(state, k, stand, targets, self._effort.depth)
+                    if done is not None:
+                        return done
+        return None
 
     @staticmethod
     def _ready(state: _State, robots: Sequence[Sequence[str]], before: Sequence[Sequence[int]]) -> list[int]:
@@ -230,6 +280,7 @@ class Insertion:
 
     def _go_home(self, state: _State, goal: Mapping[str, int]) -> _State | None:
         """The schedule in which all robots end at their goals, or None; the first order that works is taken."""
+        self._effort = _EFFORTS[-1]
         for order in itertools.islice(itertools.permutations(goal), _ORDERS):
             trial: _State | None = state
             for robot in order:
@@ -267,9 +318,10 @@ class Insertion:
             trial.at[robot] = v
             return trial
         blockers = state.time.in_the_way(leg)
-        if partners & set(blockers):
+        past = frozenset(blockers) if self._effort.around and not aside else partners & set(blockers)
+        if past:
             # Those it is to meet stay where they are: another way, past them.
-            around = self._leg(state, robot, v, partners)
+            around = self._leg(state, robot, v, past | partners)
             if around is not None and trial.time.insert(around):
                 trial.at[robot] = v
                 return trial
@@ -293,10 +345,10 @@ class Insertion:
                     yield moved
 
     def _ways_out(self, state: _State, robot: str, targets: Mapping[str, int]) -> list[int]:
-        """Vertices a robot may go to: its next stop, the start, back from where it stands, anywhere."""
+        """Vertices a robot may go to: its next stop, the start, back from where it stands, and it may be anywhere."""
         roadmap = self.roadmaps[robot]
         vertices = roadmap.open_vertices()
-        random = [vertices[i] for i in self.rng.integers(len(vertices), size=_ASIDE)]
+        random = [vertices[i] for i in self.rng.integers(len(vertices), size=_ASIDE if self._effort.anywhere else 0)]
         here = state.at[robot]
         onward = [targets[robot]] if robot in targets else []
         return [v for v in dict.fromkeys([*onward, 0, *roadmap.exits.get(here, [])[::-1], *random]) if v != here]

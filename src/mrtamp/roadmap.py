@@ -42,6 +42,8 @@ class Roadmap:
     q : (V, n) configurations.  u, v, w : (E,) end vertices and Euclidean lengths (rad) of the edges.
     contact : edge -> body that a held object may touch on it (its lift edges).
     exits : contact vertex -> the vertices of its chains, nearest first; other vertices are their own exit.
+    joined : two vertices -> the path between them that was last found beside the roadmap, in whatever mode, and how
+        often it may still be used before another is looked for.
     """
 
     def __init__(self, world: RobotWorld, reach: float = _HAND) -> None:
@@ -58,6 +60,7 @@ class Roadmap:
         self._arcs = _Arcs()
         self.contact: dict[int, tuple[str, str]] = {}
         self.exits: dict[int, list[int]] = {}
+        self.joined: dict[tuple[int, int], tuple[list[int], int]] = {}
         self._open: list[int] = []
         self._open_q = np.empty((64, self.n_dof))
         self._samples: dict[int, int] = {}

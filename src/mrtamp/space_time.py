@@ -328,6 +328,9 @@ class SpaceTime:
         if self.in_the_way(leg, [o for o in others if self.free_from[o] <= begin]):
             # They stand there all the time.
             return None
+        if not self._step(leg, others, m, m, last):
+            # Where it ends it would be in the way of who comes to rest.
+            return None
         parent: dict[tuple[int, int], tuple[int, int] | None] = {(begin, 0): None}
         queue: list[tuple[int, int, int]] = [(begin + m, 0, begin)]
         while queue:

@@ -165,13 +165,13 @@ class Steering:
             if path is not None:
                 return path, blockers
             blocked = self.validity.blocked(robot, mode, standing)
-        path = lazy_path(roadmap, start, goal, blocked, validate, rounds)
         others = {r: self.roadmaps[self.index[r]].q[v] for r, v in standing.items()} if seek else {}
-        wanted = seek or (connect and not blockers)
-        if path is None and wanted and self._connects(roadmap, mode, start, goal, others):
-            blocked = self.validity.blocked(robot, mode, standing)
-            path = lazy_path(roadmap, start, goal, blocked, validate, rounds)
-        return path, blockers
+
+        def join() -> list[int] | None:
+            wanted = seek or (connect and not blockers)
+            return self._joined(roadmap, mode, start, goal, others) if wanted else None
+
+        return self.connector.path(roadmap, start, goal, blocked, validate, rounds, join), blockers
 
     def _past(
         self,
@@ -194,15 +194,15 @@ class Steering:
         two = lazy_path(roadmap, w, goal, blocked, validate, rounds) if one is not None else None
         return None if one is None or two is None else [*one, *two[1:]]
 
-    def _connects(
+    def _joined(
         self, roadmap: Roadmap, mode: Mode, start: int, goal: int, standing: Mapping[str, np.ndarray]
-    ) -> bool:
+    ) -> list[int] | None:
         """The roadmap has no way: look for one, harder each time, and ever more rarely where that is in vain."""
         key = (roadmap.name, mode.key, start, goal, *(x.tobytes() for x in standing.values()))
         self._sought[key] += 1
         tries = self._sought[key]
         if tries > _SEARCHES and tries & (tries - 1):
-            return False
+            return None
         return self.connector.connect(roadmap, mode, start, goal, _TREE << min(tries, _SEARCHES), standing)
 
     def _follow(self, node: Node, robot: str, path: list[int]) -> Node:

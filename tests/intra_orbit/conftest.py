@@ -7,4 +7,4 @@ from mrtamp.connect import Connector
 
 @pytest.fixture(autouse=True)
 def roadmaps_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Connector, "connect", lambda *_: False)
+    monkeypatch.setattr(Connector, "connect", lambda *_: None)
