@@ -26,8 +26,10 @@ _FINER = 3.0
 """By how much the clearance is less at every finer level."""
 _TOUCHING = -3e-4
 """Clearance (m) asked of an object and what it is lifted off or put on."""
-_SHARE = 0.25
-"""Share of the tolerated penetration that every pair may use."""
+_USED = 0.9
+"""Share of the tolerated penetration that is made use of."""
+_CONTENDS = 3e-3
+"""Distance (m) from which on a pair of solids has a share in it: the more the closer."""
 _PARTS = 24
 """Places in a step at which violations are remembered."""
 
@@ -81,6 +83,35 @@ class CollisionRows:
         return replace(self, asked=self.asked + by * self.padded)
 
 
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What is near for one robot alone or two of them, and the clearance `margin` (S,) asked for at every sample.
+
+    What penetration is tolerated is shared by all that is about to collide at the same instant.
+    """
+
+    samples: Samples
+    states: Mapping[str, State]
+    near: Near
+    touching: np.ndarray
+    margin: np.ndarray
+
+    @property
+    def _claims(self) -> np.ndarray:
+        return np.where(self.touching, 0.0, np.maximum(_CONTENDS - self.near.distance - self.near.padding, 0.0))
+
+    def contention(self, n: int) -> np.ndarray:
+        """What all pairs claim together at each of the first n samples, which are the same for all robots."""
+        return np.bincount(self.near.sample, weights=self._claims, minlength=n)[:n]
+
+    def shares(self, contention: np.ndarray) -> np.ndarray:
+        """Share (P,) of every pair, where all pairs of all robots claim so much at each of the first samples."""
+        n = len(contention)
+        own = np.bincount(self.near.sample, weights=self._claims, minlength=len(self.samples))
+        own[:n] = contention
+        return self._claims / np.maximum(own[self.near.sample], 1e-12)
+
+
 class Collisions:
     """Linearises distances along polylines, and remembers where more clearance is needed than was asked for."""
 
@@ -128,7 +159,7 @@ class Collisions:
 
     def _samples(self, n: int, extra: Mapping[tuple[int, float, int], int]) -> tuple[Samples, np.ndarray]:
         """The samples demanded, and the clearance asked for at n common ones and at each of them."""
-        least = _MARGIN / _FINER**self.level - _SHARE * self.tolerance + self.pad
+        least = _MARGIN / _FINER**self.level + self.pad
         margin = np.full(n, least)
         if not extra:
             return Samples.none(), margin
@@ -149,8 +180,7 @@ class Collisions:
     def _rows(
         self, line: Polyline, q: np.ndarray, arrangement: Arrangement, base: Samples, demands: Demands
     ) -> CollisionRows:
-        blocks: list[sparse.csr_array] = [sparse.csr_array((0, q.size + len(arrangement.c)))]
-        parts: list[tuple[np.ndarray, ...]] = [(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))]
+        found: list[_Found] = []
         clearance: dict[Who, np.ndarray] = {}
         names, ask = list(line.columns), self.nearness
         knots = {r: q[:, c] for r, c in line.columns.items()}
@@ -173,9 +203,15 @@ class Collisions:
                     touching = np.zeros(len(near.distance), dtype=bool)
                 clearance[who] = _clearance(line, base, near)
                 if len(near.distance):
-                    asked = np.where(touching, _TOUCHING, margin[near.sample])
-                    blocks.append(self.gradient(line, samples, near, states, arrangement))
-                    parts.append((near.distance, asked, near.padding, ~touching))
+                    found.append(_Found(samples, states, near, touching, margin))
+        contention = np.sum([x.contention(len(base)) for x in found], axis=0) if found else np.zeros(0)
+        blocks: list[sparse.csr_array] = [sparse.csr_array((0, q.size + len(arrangement.c)))]
+        parts: list[tuple[np.ndarray, ...]] = [(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))]
+        for x in found:
+            asked = x.margin[x.near.sample] - _USED * self.tolerance * x.shares(contention)
+            blocks.append(self.gradient(line, x.samples, x.near, x.states, arrangement))
+            asked = np.where(x.touching, _TOUCHING, asked)
+            parts.append((x.near.distance, asked, x.near.padding, ~x.touching))
         distance, wanted, padding, padded = (np.concatenate(x) for x in zip(*parts, strict=True))
         return CollisionRows(sparse.csr_array(sparse.vstack(blocks)), distance, wanted, padding, padded, clearance)
 

@@ -24,6 +24,9 @@ from mrtamp.optimise.screws import cross, screws_of, transported, upstream
 from mrtamp.optimise.shapes import Poses, Shapes
 from mrtamp.scene import Scene, chain_of, geometry_ids, robot_bodies
 
+_ROUNDING = 1e-6
+"""Error (m^2) of squared distances for which nothing that is near may be missed."""
+
 
 @dataclass(frozen=True, eq=False)
 class Samples:
@@ -349,8 +352,11 @@ class Nearness:
         maybe = np.flatnonzero(np.all(low_a < high_b + far, axis=1) & np.all(low_b < high_a + far, axis=1))
         if not len(maybe):
             return maybe
-        gap = np.linalg.norm(ca[maybe, :, None] - cb[maybe, None], axis=3) - ra[maybe, :, None] - rb[maybe, None]
-        return maybe[gap.min(axis=(1, 2)) < far]
+        a, b = ca[maybe], cb[maybe]
+        square = (a * a).sum(axis=2)[:, :, None] + (b * b).sum(axis=2)[:, None] - 2 * (a @ np.swapaxes(b, 1, 2))
+        # The squares of what is far from the origin cost some digits; what is not there has no radius.
+        limit = np.maximum(ra[maybe, :, None] + rb[maybe, None] + far, 0.0)
+        return maybe[(square < limit**2 + _ROUNDING * (limit > 0)).any(axis=(1, 2))]
 
     def pair_rows(self, a: str, b: str, qa: np.ndarray, qb: np.ndarray, mode: Mode) -> np.ndarray:
         """Positions of the plant of two robots."""

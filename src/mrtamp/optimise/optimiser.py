@@ -41,6 +41,9 @@ _LINGER, _LODGED, _YIELDS = 5, 0.004, 0.8
 _SHALLOW = 1e-3
 """Penetration (m) at the program's own samples that makes a finer look pointless."""
 _TRUE, _FALSE = 0.7, 0.25
+_GAINING, _STRIDE = 0.01, 0.6
+"""As long as every step makes a plan cheaper by that share, that much of the first trust region is kept: some of the
+collisions are left to later, smaller steps."""
 _GRAZES = 2
 """Iterates in collision, one after another, after which more clearance is asked for."""
 _PADS = (0.0, 0.003, 0.006)
@@ -260,7 +263,8 @@ class Optimiser:
             gain = self._best.cost - candidate.cost
             self._best = candidate
         self._clear_up(clean)
-        self._pace(before, after, self._promise + self._changes, clean)
+        gaining = np.isfinite(self.cost) and candidate.cost < (1 - _GAINING) * now.cost
+        self._pace(before, after, self._promise + self._changes, clean, gaining)
         return gain
 
     def _looked_at(self, solved: Iterate) -> tuple[Iterate, CollisionRows, np.ndarray]:
@@ -282,15 +286,16 @@ class Optimiser:
         projected = self._closure.project(q, solved.arrangement)
         return None if projected is None else self._iterate(now.line, self._clipped(projected), solved.arrangement)
 
-    def _pace(self, before: float, after: float, promised: float, clean: bool) -> None:
-        """Adapt the trust region to how much of the promised gain came true."""
+    def _pace(self, before: float, after: float, promised: float, clean: bool, gaining: bool) -> None:
+        """Adapt the trust region to how much of the promised gain came true; `gaining`: the cost itself still falls."""
         share = (before - after) / max(before - promised, 1e-9)
         if share > _TRUE:
             self.trust = min(1.3 * self.trust, _LARGEST)
         elif share < _FALSE:
             # What is missing only at samples between those of the program needs rows, not smaller steps.
-            self.trust = 0.5 * self.trust if clean else max(0.5 * self.trust, min(self.trust, 4 * _SMALLEST))
-        still = before - promised < _STALL * before or share < _FALSE
+            least = _STRIDE * self._first_trust if gaining else 0.0 if clean else 4 * _SMALLEST
+            self.trust = max(0.5 * self.trust, min(self.trust, least))
+        still = not gaining and (before - promised < _STALL * before or share < _FALSE)
         self._stalls = 0 if not still else self._stalls + (2 if clean else 1)
         self._settle(self.trust < _SMALLEST or self._stalls >= _PATIENCE)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from pydrake.geometry import Box, Capsule, GeometryId, HalfSpace, SceneGraphInspector, Sphere
@@ -41,6 +42,11 @@ class _Group:
     body: np.ndarray
     R: np.ndarray
     p: np.ndarray
+
+    @cached_property
+    def centred(self) -> bool:
+        """Whether the geometries are where the frames of their bodies are."""
+        return np.array_equal(self.R, np.tile(np.eye(3), (len(self.R), 1, 1))) and not self.p.any()
 
 
 class Shapes:
@@ -155,6 +161,8 @@ class Shapes:
 
 def _carried(group: _Group, poses: Poses, body: np.ndarray) -> Poses:
     R, p = poses[0][:, body], poses[1][:, body]
+    if group.centred:
+        return R, p
     return R @ group.R, p + (R @ group.p[..., None])[..., 0]
 
 
