@@ -134,3 +134,16 @@ def test_only_a_first_plan_that_is_far_dearer_than_promised_has_to_wait(
     assert (planner.realisation._shown_first(plan, proposal) is plan) is not shortened
     planner.realisation.shortening = False
     assert planner.realisation._shown_first(plan, proposal) is plan
+
+
+def test_what_the_same_search_finds_takes_the_place_of_what_has_hardly_begun(tmp_path: Path) -> None:
+    """With the same order of events it most likely becomes the same plan: it is not worth a trial of its own."""
+    planner = planner_for(tmp_path)
+    portfolio = planner.portfolio
+    dear, cheap, between = (roundabout(planner, height) for height in (-0.1, 0.9, 0.4))
+    assert portfolio.add(dear, similar=True)
+    assert portfolio.add(cheap, similar=True)
+    assert [e.plan for e in portfolio._entries] == [cheap]
+    assert not portfolio.add(between, similar=True), "it has come too late"
+    assert portfolio.add(between), "what another search finds may be different in other ways"
+    assert len(portfolio._entries) == 2

@@ -140,3 +140,39 @@ def test_a_stop_becomes_one_candidate_however_often_it_is_asked_for() -> None:
 def test_goals_that_end_in_a_hand_are_left_to_the_search() -> None:
     data = mrtamp.load_problem("handover")
     assert Planner(data, options=Options(initial_vertices=2)).skeletons.applies
+
+
+def test_where_there_is_nothing_to_choose_nothing_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One visit after the other: their only skeleton is proposed without a look at the roadmaps, if in haste."""
+    subgoals = [visit("a", "one", (0, 1)), visit("b", "two", (1, 1), "a"), visit("c", "one", (1, 0), "b")]
+    problem = arena(tmp_path, {"one": (-1, 1), "two": (-1, -1)}, subgoals=subgoals)
+    guidance = ready(problem).skeletons
+    measured = next(guidance.propose())
+
+    def length(*_: object) -> float:
+        raise AssertionError("measured")
+
+    monkeypatch.setattr(guidance, "_length", length)
+    proposal = next(guidance.propose(hasty=True))
+    assert proposal.hasty and not measured.hasty
+    assert names(proposal) == names(measured) == ["a", "b", "c"]
+    assert proposal.skeleton.cost == pytest.approx(measured.skeleton.cost), "nothing is in the way here"
+    guidance.update_bound(hasty=True)
+    with pytest.raises(AssertionError, match="measured"):
+        next(guidance.propose())
+
+
+def test_where_there_is_a_choice_haste_changes_nothing(tmp_path: Path) -> None:
+    guidance = ready(visits(tmp_path)).skeletons
+    hasty, measured = (list(guidance.propose(hasty=h)) for h in (True, False))
+    assert not any(p.hasty for p in hasty)
+    assert [p.skeleton.cost for p in hasty] == pytest.approx([p.skeleton.cost for p in measured])
+
+
+def test_what_all_ways_of_a_task_have_against_them_counts_for_nothing(tmp_path: Path) -> None:
+    """Only ways can be told apart by experience: where there is one, a skeleton stays as promising as it was."""
+    guidance = ready(visits(tmp_path)).skeletons
+    before = next(guidance.propose())
+    for way in before.ways:
+        guidance.failed(way)
+    assert next(guidance.propose()).skeleton.cost == pytest.approx(before.skeleton.cost)

@@ -133,12 +133,14 @@ class Growth:
         *,
         varied: bool = False,
         alone: bool = False,
+        urgent: bool = False,
     ) -> Timed | None:
         """Realise a skeleton in space and time, motions of all robots inserted among each other; None if that fails.
 
         The stop at which it ends is reported to the guidance.  With `varied`, and where its order was realised before,
         order and ways are in part left to chance; that such an attempt fails is not held against the skeleton.
-        `alone`: robots may collide with each other, for convex programs to pull apart.
+        `alone`: robots may collide with each other, for convex programs to pull apart.  `urgent`: the stop for which
+        others wait the longest happens next, instead of the one that can happen soonest.
         """
         stops = [stop for stop, _ in proposal.stops]
         start = dict(zip(self.names, root.at, strict=True))
@@ -151,6 +153,7 @@ class Growth:
             self.goal_vertices,
             _VARIETY if varied or proposal.repeated else 0.0,
             alone=alone,
+            latest=skeletons.latest(proposal) if urgent else None,
         )
         if timed is None:
             assert self.insertion.stuck is not None

@@ -255,12 +255,21 @@ class Planner:
             # Attempts that take long, and fail, leave search its half of the time.
             turn = self.iteration % _SKELETON_TURN == 0 and self._tried["skeletons"] <= self._tried["search"] + _AHEAD
             return "skeletons" if skeletons and turn else "search"
-        refine = self._uses("refinement") and not self.portfolio.idle(self._to_beat())
-        if skeletons and refine and self.realisation.undrafted:
+        to_beat = self._to_beat()
+        refine = self._uses("refinement") and not self.portfolio.idle(to_beat)
+        busy = refine and self.portfolio.busy
+        if refine and not self.skeletons.has_choice:
+            # Others would only be other motions of the same ways: they wait until those there are have converged.
+            skeletons = skeletons and not self.portfolio.converging(to_beat)
+            busy = busy or self.portfolio.nearing(to_beat)
+        elif skeletons and refine and self.realisation.undrafted:
             return "skeletons"
-        skeletons = skeletons and not (refine and self.portfolio.busy)
-        available = ["search", *(["skeletons"] if skeletons else []), *(["refinement"] if refine else [])]
-        return self._effort.next(available, eager="refinement" if refine and self.portfolio.busy else None)
+        available = [
+            "search",
+            *(["skeletons"] if skeletons and not busy else []),
+            *(["refinement"] if refine else []),
+        ]
+        return self._effort.next(available, eager="refinement" if busy else None)
 
     def _uses(self, mechanism: str) -> bool:
         return mechanism not in self.options.without
@@ -342,9 +351,9 @@ class Planner:
         if self._found(plan) and self._uses("adoption"):
             self._graft(plan)
 
-    def _found(self, plan: Plan) -> bool:
+    def _found(self, plan: Plan, *, similar: bool = False) -> bool:
         """There is a plan: it is refined, and from now on the tree is rewired; whether it is a new one."""
-        new = not self._uses("refinement") or self.portfolio.add(plan)
+        new = not self._uses("refinement") or self.portfolio.add(plan, similar=similar)
         # Skeletons that only lead to known plans are asked for ever more rarely.
         self._stale = 0 if new else min(self._stale + 1, _RAREST)
         self._skeletons_from = self.iteration + 2**self._stale
@@ -398,7 +407,7 @@ class Planner:
         better = self._offer(plan)
         if better:
             self.orbit_guidance.path = [g[0].orbit for g in groups]
-        self._found(plan)
+        self._found(plan, similar=True)
         return better
 
     def _refine(self) -> None:

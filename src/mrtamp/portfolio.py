@@ -27,8 +27,9 @@ _ALONE = 1200
 """The same where there is no convex programming."""
 _STALE = 0.004
 """Relative gain of a turn below which shortening has done its part."""
-_TRIAL = 5
-"""Conic programs that a plan gets before it is compared with the others."""
+_TRIAL, _FAST = 5, 0.03
+"""Conic programs that a plan gets before it is compared with the others, and more as long as each makes it cheaper by
+that share."""
 _HOPELESS = 1.12
 """Plans that cost so many times the incumbent after their trial wait until nothing else is left to do."""
 _LUCK = 0.93
@@ -91,11 +92,19 @@ class _Entry:
 
     @property
     def on_trial(self) -> bool:
-        return not self.done and (self.optimiser is None or self.optimiser.steps < _TRIAL)
+        if self.done or self.optimiser is None:
+            return not self.done
+        falling = len(self.trail) > 1 and self.trail[-1] < (1 - _FAST) * self.trail[-2]
+        return self.optimiser.steps < _TRIAL or falling
 
     @property
     def began_as_draft(self) -> bool:
         return bool(np.isfinite(self.estimate))
+
+    @property
+    def fresh(self) -> bool:
+        """Whether it has not converged for the first time."""
+        return self.rounds == 0 and not self.done
 
     @property
     def fresh_draft(self) -> bool:
@@ -108,6 +117,10 @@ class _Entry:
         round, where re-timing and finer steps gain most."""
         begun = self.rounds == 1 or (self.rounds == 0 and not self.on_trial)
         return begun and self.began_as_draft
+
+    def is_near(self, incumbent: float) -> bool:
+        """Whether it is about to beat the incumbent clearly."""
+        return bool(self.trail) and self.outlook < _NEARLY * incumbent
 
     def hopeless(self, incumbent: float, most: float) -> bool:
         """Whether it is a draft to give up: its estimate is above `most`, where no draft so far has ended cheap enough,
@@ -147,12 +160,20 @@ class Portfolio:
         self.nearness = Nearness(validity.collision)
         self.yielding = Yielding(problem, self.nearness)
 
-    def add(self, plan: Plan) -> bool:
-        """Put a checked plan under refinement; False if one like it is or was."""
+    def add(self, plan: Plan, *, similar: bool = False) -> bool:
+        """Put a checked plan under refinement; False if one like it is or was.
+
+        `similar`: it comes of the same search as those before, and with the same order of events it most likely becomes
+        the same plan.  Then it takes the place of one that has hardly begun, or else has come too late.
+        """
         alike = [e for e in self._entries if _order(e.plan.transitions) == _order(plan.transitions)]
         if round(plan.cost, 6) in self._seen or any(abs(e.cost - plan.cost) < _ALIKE * plan.cost for e in alike):
             return False
+        fresh = [e for e in alike if similar and e.fresh and not e.began_as_draft]
+        if any(e.outlook < plan.cost for e in fresh):
+            return False
         self._seen.add(round(plan.cost, 6))
+        self._entries = [e for e in self._entries if not (e in fresh and e.on_trial)]
         self._admit([_Entry(plan)])
         return True
 
@@ -222,6 +243,14 @@ class Portfolio:
         """Whether a plan is on trial: until it is over, more plans would only wait."""
         return any(e.on_trial for e in self._entries)
 
+    def converging(self, incumbent: float) -> bool:
+        """Whether a plan that may beat `incumbent` has not converged for the first time."""
+        return any(e.fresh and (e.on_trial or e.outlook < _HOPELESS * incumbent) for e in self._entries)
+
+    def nearing(self, incumbent: float) -> bool:
+        """Whether a plan is about to beat `incumbent` clearly."""
+        return any(e.is_near(incumbent) and not e.draft for e in self._entries)
+
     @property
     def outlook(self) -> float:
         """The least that a plan under refinement is likely to cost soon."""
@@ -240,7 +269,7 @@ class Portfolio:
         """
         most = self.worth_drafting(incumbent) if self._share else np.inf
         self._entries = [e for e in self._entries if not e.hopeless(incumbent, most)]
-        near = [e for e in self._entries if e.trail and e.outlook < _NEARLY * incumbent]
+        near = [e for e in self._entries if e.is_near(incumbent)]
         if near:
             return min(near, key=lambda e: e.outlook)
         ahead = next((e for e in self._entries if e.goes_ahead and e.cost <= incumbent + _EPS), None)

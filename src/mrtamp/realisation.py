@@ -6,7 +6,6 @@ and changes what it proposes next.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -98,8 +97,10 @@ class Realisation:
         self.shortening = shortening
         self.undrafted = self.drafts
         self._turn = 0
-        self._early = False
+        self._early = self._urgent = False
         self._drafted = _Drafted()
+        self._crowded: set[frozenset[Way]] = set()
+        """Ways whose draft had too much conflict, and in place of which there are no others."""
 
     def attempt(self) -> Plan | Node | None:
         """Grow the sets of ways and realise the cheapest skeletons that may beat the incumbent, until one succeeds.
@@ -110,14 +111,14 @@ class Realisation:
         """
         first = self._first
         self._grow()
-        self.skeletons.update_bound()
+        self.skeletons.update_bound(hasty=first)
         if not first and self.drafts and self._draft():
             return None
         tries = 0
         while tries < _REALISATIONS:
             failed: set[Way] = set()
             inserted: list[tuple[float, Timed, SpaceTime, Proposal]] = []
-            for proposal in self.skeletons.propose(self.to_beat(), _QUICK if first else _THOROUGH):
+            for proposal in self.skeletons.propose(self.to_beat(), _QUICK if first else _THOROUGH, hasty=first):
                 if not failed.isdisjoint(proposal.ways):
                     # The guidance has learnt something about these since.
                     continue
@@ -125,7 +126,7 @@ class Realisation:
                 best = self._cheapest_insertion(proposal)
                 if best is not None:
                     inserted.append((*best, proposal))
-                    if first or len(inserted) == _RIVALS:
+                    if first or len(inserted) == _RIVALS or not self.skeletons.has_choice:
                         break
                     continue
                 node = self.growth.realise(proposal, self.skeletons, self.root)
@@ -148,7 +149,8 @@ class Realisation:
 
     def _shown_first(self, plan: Plan, proposal: Proposal) -> Plan:
         """The first plan, shortened a little where it is far dearer than its skeleton promised and that is quick."""
-        dear = plan.cost > _DEAR * proposal.skeleton.cost and len(proposal.stops) <= _MANY
+        few = len(proposal.stops) <= _MANY and not proposal.hasty
+        dear = few and plan.cost > _DEAR * proposal.skeleton.cost
         return self.portfolio.shortened(plan, _SHORTCUTS) if dear and self.shortening else plan
 
     def _judged(self, timed: Timed | None, schedule: SpaceTime | None, proposal: Proposal) -> Plan | None:
@@ -203,24 +205,35 @@ class Realisation:
         """Two times out of three, put some cheap skeletons under refinement as they are; whether that was all.
 
         Each robot goes its way as if it were alone, and only the timing makes them yield to one another.  Where that
-        leaves little conflict, convex programs pull them apart at hardly more than the skeleton promised.
+        leaves little conflict, convex programs pull them apart at hardly more than the skeleton promised.  Without a
+        choice of ways drafts hardly differ: then it is one, every other time.
         """
         self._turn += 1
-        if self._turn % 3 == 0:
+        choice = self.skeletons.has_choice
+        if self._turn % 3 == 0 if choice else self._turn % 2 == 1:
             return False
         self.undrafted = False
         drafts: list[tuple[float, Draft]] = []
         sketched = 0
-        while sketched < _SKETCHED and len(drafts) < _DRAFTS:
+        while sketched < _SKETCHED and len(drafts) < (_DRAFTS if choice else 1):
             below = self.portfolio.worth_drafting(self.to_beat())
             found = self.skeletons.propose(below, _THOROUGH)
-            proposals = list(itertools.islice((p for p in found if not self._drafted.knows(p)), _AT_ONCE))
+            proposals, crowded = [], False
+            for proposal in found:
+                if frozenset(proposal.ways) in self._crowded:
+                    crowded = True
+                elif not self._drafted.knows(proposal):
+                    proposals.append(proposal)
+                if len(proposals) == _AT_ONCE:
+                    break
             if not proposals:
-                if not sketched:
-                    # Nothing promises a gain, however it were realised.
+                # Nothing promises a gain, however it were realised, unless it only has to be realised in another way.
+                if not sketched and not crowded:
                     return True
                 break
             for proposal in proposals:
+                if frozenset(proposal.ways) in self._crowded or (drafts and not choice):
+                    continue
                 sketched += 1
                 draft = self._sketch(proposal)
                 if draft is not None:
@@ -241,6 +254,8 @@ class Realisation:
         if draft.conflict < _CONFLICT:
             return draft
         self.skeletons.crowded(proposal, draft.conflict)
+        if not self.skeletons.has_choice:
+            self._crowded.add(frozenset(proposal.ways))
         return None
 
     def _cheapest_insertion(self, proposal: Proposal) -> tuple[float, Timed, SpaceTime] | None:
@@ -250,18 +265,39 @@ class Realisation:
         They differ by chance, and what starts cheaper usually ends cheaper: far less work than refining all of them.
         Before there is a plan, more than one is tried only where that is quick and the first far dearer than promised.
         """
+        if not self._first and not self.skeletons.has_choice:
+            return self._another_insertion(proposal)
         best: tuple[float, Timed, SpaceTime] | None = None
         for k in range(_INSERTIONS):
-            timed = self.growth.insert(proposal, self.skeletons, self.root, varied=k > 0)
-            schedule = self.growth.insertion.schedule
-            if timed is not None and schedule is not None:
-                cost = plan_cost(*timed, self.growth.problem.cost)
-                if best is None or cost < best[0]:
-                    best = cost, timed, schedule
-            good = best is not None and best[0] < _POOR * proposal.skeleton.cost
+            inserted = self._insertion(proposal, varied=k > 0)
+            if inserted is not None and (best is None or inserted[0] < best[0]):
+                best = inserted
+            good = proposal.hasty or (best is not None and best[0] < _POOR * proposal.skeleton.cost)
             if best is None or (self._first and (good or len(proposal.stops) > _MANY)):
                 break
         return best
+
+    def _another_insertion(self, proposal: Proposal) -> tuple[float, Timed, SpaceTime] | None:
+        """A realisation that differs by chance from those there were of the same ways, None if several attempts fail.
+
+        What it costs does not tell how cheap it becomes: robots give way to each other in another order or on the other
+        side, which only refinement shows the worth of.
+        """
+        for _ in range(_INSERTIONS):
+            self._urgent = not self._urgent
+            inserted = self._insertion(proposal, varied=True, urgent=self._urgent)
+            if inserted is not None:
+                return inserted
+        return None
+
+    def _insertion(
+        self, proposal: Proposal, *, varied: bool, urgent: bool = False
+    ) -> tuple[float, Timed, SpaceTime] | None:
+        timed = self.growth.insert(proposal, self.skeletons, self.root, varied=varied, urgent=urgent)
+        schedule = self.growth.insertion.schedule
+        if timed is None or schedule is None:
+            return None
+        return plan_cost(*timed, self.growth.problem.cost), timed, schedule
 
 
 class _Drafted:

@@ -12,15 +12,16 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import networkx as nx
 import numpy as np
 
+from mrtamp.connect import Connector
 from mrtamp.deadline import Deadline
 from mrtamp.guidance import ModalGuidance
 from mrtamp.modes import Attachment, Mode
 from mrtamp.optimise.descent import Descent, Surroundings
 from mrtamp.plan import Plan
 from mrtamp.problem import HeldBy, Problem, RobotAt
-from mrtamp.roadmap import lazy_path
 from mrtamp.schedule import FAR, Distance
 from mrtamp.skeletons import Event, Option, Skeleton, Task, lower_bound, skeletons
 from mrtamp.transitions.candidate import Candidate, SolvedHandover
@@ -41,6 +42,8 @@ _TRIES = 4
 """Calls without result after which a set of ways is grown now and then only."""
 _ROUNDS = 200
 """Lazy searches for the length of one roadmap path."""
+_TREE = 100
+"""Tree extensions to find one where the roadmap has none."""
 _ADMITTED = 4
 """Shortened ways that are kept at a time, of different lengths."""
 _SLACK, _UNHURRIED = 0.5, 0.1
@@ -55,13 +58,14 @@ class Proposal:
     """A skeleton and its stops in the order in which they happen, with the ways they belong to.
 
     `before` lists for every stop the numbers of those that must happen earlier; `repeated` is how often this order was
-    realised already.
+    realised already; `hasty` says that its cost leaves obstacles out of account.
     """
 
     skeleton: Skeleton
     stops: tuple[tuple[Stop, Way], ...]
     before: tuple[tuple[int, ...], ...]
     repeated: int
+    hasty: bool = False
 
     @property
     def ways(self) -> list[Way]:
@@ -94,6 +98,7 @@ class SkeletonGuidance:
         self.root = root
         self.rng = sampler.rng
         self.ways = Ways(sampler)
+        self.connector = Connector(sampler.validity, self.rng, self.deadline)
         self._chains: dict[str, tuple[Attachment, ...]] = {}
         self.bound: float | None = None
         self._realised: Counter[tuple] = Counter()
@@ -210,8 +215,22 @@ class SkeletonGuidance:
 
         Keys are the robot and the number of the stop; the end has the next number.
         """
+        waits, earliest, latest = self._schedule(proposal)
+        return {
+            (r, k): float(latest[k] - earliest[j] - length)
+            for k in range(len(waits))
+            for r, j, length in waits[k]
+            if r is not None
+        }
+
+    def latest(self, proposal: Proposal) -> list[float]:
+        """When (rad) every stop has to happen at the latest for the decoupled schedule not to take longer."""
+        return self._schedule(proposal)[2][: len(proposal.stops)].tolist()
+
+    def _schedule(self, proposal: Proposal) -> tuple[list[list[tuple[str | None, int, float]]], np.ndarray, np.ndarray]:
+        """What every stop and the end wait for (robot, number of a stop, length of the motion from there), and when
+        they happen at the earliest and at the latest, if every robot moves straight as if it were alone."""
         stops, n = [stop for stop, _ in proposal.stops], len(proposal.stops)
-        # What has to be over before every stop, and the end, and how long the motion from there takes.
         waits: list[list[tuple[str | None, int, float]]] = [[(None, j, 0.0) for j in b] for b in proposal.before]
         waits.append([])
         last = {r.name: (-1, r.start) for r in self.problem.robots}
@@ -231,12 +250,7 @@ class SkeletonGuidance:
         for k in reversed(range(n + 1)):
             for _, j, length in waits[k]:
                 latest[j] = min(latest[j], latest[k] - length)
-        return {
-            (r, k): float(latest[k] - earliest[j] - length)
-            for k in range(n + 1)
-            for r, j, length in waits[k]
-            if r is not None
-        }
+        return waits, earliest, latest
 
     def _shorten(
         self,
@@ -315,36 +329,40 @@ class SkeletonGuidance:
         ends: dict[str, np.ndarray | None] = {r.name: None for r in self.problem.robots}
         return ends | {c.robot: c.q for c in self.problem.goal if isinstance(c, RobotAt)}
 
-    def _option(self, ways: list[Way], penalised: bool) -> Option:
+    def _option(self, ways: list[Way], penalised: bool, least: float) -> Option:
+        """Ways as an option of a task; penalties count by how much they exceed the `least` of all ways of the task."""
         stops = ways[0].stops
         events = tuple(
             Event(s.kind, {r: np.array([w.stops[i].q[r] for w in ways]) for r in s.robots}) for i, s in enumerate(stops)
         )
         constant = self.problem.cost.of_changes(s.kind for s in stops)
-        penalty = np.array([w.penalty for w in ways]) if penalised else None
+        penalty = np.array([w.penalty - least for w in ways]) if penalised else None
         return Option(ways[0].robots, events, constant, penalty)
 
     def _question(self, sets: Mapping[str, list[list[Way]]], *, penalised: bool) -> tuple:
         """Tasks, precedence, starts, ends and weights, as the search for skeletons and the bound take them."""
-        tasks = [Task(name, tuple(self._option(w, penalised) for w in ways)) for name, ways in sets.items()]
+        least = {name: min(w.penalty for ways in options for w in ways) for name, options in sets.items()}
+        tasks = [Task(n, tuple(self._option(w, penalised, least[n]) for w in options)) for n, options in sets.items()]
         starts = {r.name: r.start for r in self.problem.robots}
         return tasks, self._precedence(), starts, self._ends(), self.problem.cost
 
     # -- proposals ------------------------------------------------------------------------------------------------
 
-    def propose(self, below: float = np.inf, effort: int = 300) -> Iterator[Proposal]:
+    def propose(self, below: float = np.inf, effort: int = 300, *, hasty: bool = False) -> Iterator[Proposal]:
         """Skeletons whose estimate is less than `below`, cheapest first, those realised before held back a little.
 
-        `effort` bounds the search among orders where they are too many for exact methods.
+        `effort` bounds the search among orders where they are too many for exact methods.  `hasty`: lengths are
+        measured on the roadmaps, which takes time, only where there is more than one skeleton to choose from.
         """
         sets = self._options()
         if sets is None or not self.applies:
             return
+        hasty = hasty and self._determined(sets)
         found = skeletons(
             *self._question(sets, penalised=True),
             limit=_LIMIT,
             rng=self.rng,
-            distance=self._distance(sets),
+            distance=None if hasty else self._distance(sets),
             effort=effort,
         )
         found.sort(key=lambda x: x.cost * (1 + _REPEATED * self._realised[x.order]))
@@ -353,7 +371,25 @@ class SkeletonGuidance:
                 continue
             ways = {name: sets[name][o][m] for name, (o, m) in skeleton.choices.items()}
             stops = tuple((ways[h.task].stops[h.event], ways[h.task]) for h in skeleton.happenings)
-            yield Proposal(skeleton, stops, self._before(skeleton, sets), self._realised[skeleton.order])
+            yield Proposal(skeleton, stops, self._before(skeleton, sets), self._realised[skeleton.order], hasty)
+
+    @property
+    def has_choice(self) -> bool:
+        """Whether there is not just one way for every task."""
+        known = Counter[str]()
+        for (item, _), ways in self.ways.of.items():
+            known[item] += len(ways)
+        counts = [known[item] for item in self.items]
+        counts += [len(self.sampler.reaching.stands(s.name)) for s in self.problem.subgoals]
+        return any(n != 1 for n in counts)
+
+    def _determined(self, sets: Mapping[str, list[list[Way]]]) -> bool:
+        """Whether there is one way for every task and one order of them all."""
+        if self.has_choice or any(len(options[0][0].stops) > 1 for options in sets.values()):
+            return False
+        order = nx.DiGraph([(a, b) for (a, _), (b, _) in self._precedence()])
+        order.add_nodes_from(sets)
+        return nx.is_directed_acyclic_graph(order) and nx.dag_longest_path_length(order) == len(sets) - 1
 
     def _distance(self, sets: Mapping[str, list[list[Way]]]) -> Distance | None:
         """Lengths of roadmap paths where stops are few and stand on the roadmaps; else None: straight lines."""
@@ -389,7 +425,15 @@ class SkeletonGuidance:
             self.deadline.check()
             roadmap.offer_direct(a, b)
             blocked = validity.blocked(robot, self.root, {})
-            path = lazy_path(roadmap, a, b, blocked, lambda e: validity.edge(robot, e, self.root), _ROUNDS)
+            path = self.connector.path(
+                roadmap,
+                a,
+                b,
+                blocked,
+                lambda e: validity.edge(robot, e, self.root),
+                _ROUNDS,
+                lambda: self.connector.connect(roadmap, self.root, a, b, _TREE),
+            )
             pairs = itertools.pairwise(path or [])
             length = sum(float(np.linalg.norm(roadmap.q[u] - roadmap.q[v])) for u, v in pairs) if path else np.inf
             known = self._lengths[robot, a, b] = (roadmap.n_vertices, length)
@@ -404,12 +448,13 @@ class SkeletonGuidance:
             before[number[b, j % count[b]]].append(number[a, i % count[a]])
         return tuple(tuple(x) for x in before)
 
-    def update_bound(self) -> None:
-        """Compute the least cost over all ways sampled so far."""
+    def update_bound(self, *, hasty: bool = False) -> None:
+        """Compute the least cost over all ways sampled so far; `hasty` as in `propose`: it may be less than that."""
         sets = self._options()
         if sets is None or not self.applies:
             return
-        bound = lower_bound(*self._question(sets, penalised=False), distance=self._distance(sets))
+        distance = None if hasty and self._determined(sets) else self._distance(sets)
+        bound = lower_bound(*self._question(sets, penalised=False), distance=distance)
         self.bound = bound.value if bound.value < FAR else None
 
     def failed(self, way: Way) -> None:
