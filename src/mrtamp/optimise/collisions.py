@@ -204,11 +204,14 @@ class Collisions:
                 clearance[who] = _clearance(line, base, near)
                 if len(near.distance):
                     found.append(_Found(samples, states, near, touching, margin))
-        contention = np.sum([x.contention(len(base)) for x in found], axis=0) if found else np.zeros(0)
+        tolerated = bool(found) and self.tolerance > 0
+        contention = np.sum([x.contention(len(base)) for x in found], axis=0) if tolerated else np.zeros(0)
         blocks: list[sparse.csr_array] = [sparse.csr_array((0, q.size + len(arrangement.c)))]
         parts: list[tuple[np.ndarray, ...]] = [(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))]
         for x in found:
-            asked = x.margin[x.near.sample] - _USED * self.tolerance * x.shares(contention)
+            asked = x.margin[x.near.sample]
+            if tolerated:
+                asked = asked - _USED * self.tolerance * x.shares(contention)
             blocks.append(self.gradient(line, x.samples, x.near, x.states, arrangement))
             asked = np.where(x.touching, _TOUCHING, asked)
             parts.append((x.near.distance, asked, x.near.padding, ~x.touching))
