@@ -155,6 +155,16 @@ def test_a_cut_removes_the_whole_subtree_and_its_place_may_be_taken_again() -> N
     check(tree)
 
 
+def test_modes_grow_on_after_all_their_nodes_were_cut() -> None:
+    tree = a_tree()
+    root = tree.add_root(BEFORE, (0, 0), 0)
+    for k in range(40):
+        held = tree.insert_transition(root, PICK, AFTER, 1, 0.5)
+        assert tree.find(AFTER, (0, 0)) is held, k
+        tree.cut(held)
+    check(tree)
+
+
 def test_a_refuted_step_is_replaced_by_the_cheapest_other_proof() -> None:
     tree = a_tree()
     root = tree.add_root(BEFORE, (0, 0), 0)

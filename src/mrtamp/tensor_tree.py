@@ -328,7 +328,8 @@ class _Rows:
         if n == len(self.at):
             self.nodes = [x for x in self.nodes if x.alive]
             n = len(self.nodes)
-            self.at = np.concatenate([np.array([x.at for x in self.nodes]), np.empty_like(self.at)])
+            kept = np.array([x.at for x in self.nodes], dtype=np.int64).reshape(n, self.at.shape[1])
+            self.at = np.concatenate([kept, np.empty_like(self.at)])
         self.at[n] = node.at
         self.nodes.append(node)
 
