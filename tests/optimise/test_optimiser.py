@@ -170,11 +170,11 @@ def test_a_violation_that_the_judge_found_makes_the_optimiser_keep_clear(tmp_pat
     refused = scp.cost
     sides = (Side("robot", "left", "tool"), Side("robot", "right", "tool"))
     scp.tighten(Report([Violation("collision", "made up", 3, 1, 0.5, 1e-4, sides)]))
-    assert scp.cost == pytest.approx(plan.cost)
+    assert refused - 0.5 < scp.cost <= plan.cost, "what was refused is mended, or given up"
+    assert scp.collisions.demands[("left", "right")]
     assert not scp.converged
     run(scp, 12)
-    assert scp.cost < plan.cost
-    assert scp.cost > refused - 0.5
+    assert refused - 0.5 < scp.cost < plan.cost
     assert judged(scp).ok
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -26,10 +27,12 @@ _FINER = 3.0
 """By how much the clearance is less at every finer level."""
 _TOUCHING = -3e-4
 """Clearance (m) asked of an object and what it is lifted off or put on."""
-_USED = 0.9
+_USED = 0.95
 """Share of the tolerated penetration that is made use of."""
 _CONTENDS = 3e-3
 """Distance (m) from which on a pair of solids has a share in it: the more the closer."""
+_FAINT = 1e-6
+"""What farther pairs claim where no pair is as close as that: the closest has it all."""
 _PARTS = 24
 """Places in a step at which violations are remembered."""
 
@@ -39,8 +42,8 @@ class CollisionRows:
     """Linearised distances: A (P, K * N + coordinates) of `distance` (P,), and the clearance `asked` (P,) of each.
 
     Where robots stand, shapes count without `padding` (P,); `padded` (P,) are those of which more clearance may be
-    asked.  `clearance` is the least distance (K - 1, 3) at the beginning, the middle and the end of every step, as far
-    as it is less than what enters the program.
+    asked.  `clearance` is the least distance (K - 1, m + 1) at equal intervals along every step, as far as it is less
+    than what enters programs.
     """
 
     A: sparse.csr_array
@@ -98,26 +101,59 @@ class _Found:
 
     @property
     def _claims(self) -> np.ndarray:
-        return np.where(self.touching, 0.0, np.maximum(_CONTENDS - self.near.distance - self.near.padding, 0.0))
+        distance = self.near.distance + self.near.padding
+        claims = np.maximum(_CONTENDS - distance, 0.0) + _FAINT * np.exp(-np.maximum(distance, 0.0) / _CONTENDS)
+        return np.where(self.touching, 0.0, claims)
 
-    def contention(self, n: int) -> np.ndarray:
-        """What all pairs claim together at each of the first n samples, which are the same for all robots."""
-        return np.bincount(self.near.sample, weights=self._claims, minlength=n)[:n]
+    @property
+    def claimed(self) -> np.ndarray:
+        """What all pairs claim together at each sample (S,)."""
+        return np.bincount(self.near.sample, weights=self._claims, minlength=len(self.samples))
 
     def shares(self, contention: np.ndarray) -> np.ndarray:
-        """Share (P,) of every pair, where all pairs of all robots claim so much at each of the first samples."""
-        n = len(contention)
-        own = np.bincount(self.near.sample, weights=self._claims, minlength=len(self.samples))
-        own[:n] = contention
-        return self._claims / np.maximum(own[self.near.sample], 1e-12)
+        """Share (P,) of every pair, where all pairs of all robots claim so much at each sample (S,)."""
+        return self._claims / np.maximum(contention[self.near.sample], 1e-300)
+
+
+def _contention(found: Sequence[_Found], n: int) -> list[np.ndarray]:
+    """What all of them together claim at each sample of each; the first n samples are the same for all."""
+    claimed = [x.claimed for x in found]
+    common = np.sum([x[:n] for x in claimed], axis=0)
+    places = [np.column_stack([x.samples.lo, np.round(_PARTS * x.samples.t), x.samples.segment])[n:] for x in found]
+    which = np.unique(np.concatenate(places), axis=0, return_inverse=True)[1].reshape(-1)
+    total = np.bincount(which, weights=np.concatenate([x[n:] for x in claimed]))
+    ends = np.cumsum([0, *map(len, places)])
+    return [np.concatenate([common, total[which[a:b]]]) for a, b in itertools.pairwise(ends.tolist())]
 
 
 class Collisions:
-    """Linearises distances along polylines, and remembers where more clearance is needed than was asked for."""
+    """Linearises distances along polylines, and remembers where more clearance is needed than was asked for.
 
-    def __init__(self, nearness: Nearness, tolerance: float) -> None:
+    Parameters
+    ----------
+    nearness : measures distances.
+    tolerance : penetration (m) that the problem tolerates at an instant.
+    pieces : samples per step.
+    reach : distance (m) below which pairs of solids enter programs.
+    margin, stricter : clearance (m) that is asked for, and how much more for every time that a sample was in collision.
+    """
+
+    def __init__(
+        self,
+        nearness: Nearness,
+        tolerance: float,
+        *,
+        pieces: int = 2,
+        reach: float = _NEAR,
+        margin: float = _MARGIN,
+        stricter: float = _STRICTER,
+    ) -> None:
         self.nearness = nearness
         self.tolerance = tolerance
+        self.pieces = pieces
+        self.reach = reach
+        self.margin = margin
+        self.stricter = stricter
         self.level = 0
         self.pad = 0.0
         """Clearance (m) that is asked for everywhere on top, to come free of collision between samples too."""
@@ -130,12 +166,18 @@ class Collisions:
         """Ask for no more than everywhere."""
         self.demands = {}
 
-    def learn(self, violations: Sequence[Violations]) -> Demands:
-        """Every violating sample becomes a row of the next programs, stricter each time it recurs; returns them."""
+    def learn(self, violations: Sequence[Violations], *, as_deep: bool = False) -> Demands:
+        """Every violating sample becomes a row of the next programs, stricter each time it recurs; returns them.
+
+        `as_deep`: stricter by what the penetration is, too.
+        """
         fresh: Demands = {}
         for v in violations:
-            for lo, t, s in zip(v.samples.lo.tolist(), v.samples.t.tolist(), v.samples.segment.tolist(), strict=True):
-                key = self.demand(v.who, lo, t, s)
+            depth = v.depth if as_deep else np.zeros(len(v.depth))
+            for lo, t, s, d in zip(
+                *(x.tolist() for x in (v.samples.lo, v.samples.t, v.samples.segment, depth)), strict=True
+            ):
+                key = self.demand(v.who, lo, t, s, d)
                 fresh.setdefault(v.who, {})[key] = self.demands[v.who][key]
         return fresh
 
@@ -143,7 +185,7 @@ class Collisions:
         """Ask for more clearance at one place, where the penetration was `depth` (m)."""
         rows = self.demands.setdefault(who, {})
         key = (lo, round(t * _PARTS) / _PARTS, segment)
-        rows[key] = rows.get(key, 0) + 1 + int(np.ceil(depth / _STRICTER))
+        rows[key] = rows.get(key, 0) + 1 + int(np.ceil(depth / self.stricter))
         return key
 
     def move(self, u: np.ndarray) -> None:
@@ -159,19 +201,19 @@ class Collisions:
 
     def _samples(self, n: int, extra: Mapping[tuple[int, float, int], int]) -> tuple[Samples, np.ndarray]:
         """The samples demanded, and the clearance asked for at n common ones and at each of them."""
-        least = _MARGIN / _FINER**self.level + self.pad
+        least = self.margin / _FINER**self.level + self.pad
         margin = np.full(n, least)
         if not extra:
             return Samples.none(), margin
         lo, t, segment = (np.array(x) for x in zip(*extra, strict=True))
-        strict = least + _STRICTER * np.array(list(extra.values()))
+        strict = least + self.stricter * np.array(list(extra.values()))
         return Samples(lo, t, segment), np.concatenate([margin, strict])
 
     # -- rows -------------------------------------------------------------------------------------------------------
 
     def rows(self, line: Polyline, q: np.ndarray, arrangement: Arrangement) -> CollisionRows:
         """Distances and their gradients at knots, midpoints, and wherever they were demanded, at knots q (K, N)."""
-        return self._rows(line, q, arrangement, knot_samples(line, np.full(line.knots - 1, 2)), self.demands)
+        return self._rows(line, q, arrangement, knot_samples(line, np.full(line.knots - 1, self.pieces)), self.demands)
 
     def more(self, line: Polyline, q: np.ndarray, arrangement: Arrangement, demands: Demands) -> CollisionRows:
         """The same at some demanded places only."""
@@ -196,22 +238,25 @@ class Collisions:
                     states = {r: common[r].joined(more[r]) for r in who}
                 if other is None:
                     near = ask.world(robot, states[robot], samples, arrangement, _NEAR)
-                    touching = ask.touching(robot, contact_of(line.stretches, robot, samples), near)
                 else:
                     pair = (states[other], states[robot])
                     near = ask.between((other, robot), pair, samples, arrangement, _NEAR)
-                    touching = np.zeros(len(near.distance), dtype=bool)
-                clearance[who] = _clearance(line, base, near)
+                clearance[who] = self._clearance(line, base, near)
+                if self.reach < _NEAR:
+                    near = near.of(near.distance < self.reach)
+                touching = np.zeros(len(near.distance), dtype=bool)
+                if other is None:
+                    touching = ask.touching(robot, contact_of(line.stretches, robot, samples), near)
                 if len(near.distance):
                     found.append(_Found(samples, states, near, touching, margin))
         tolerated = bool(found) and self.tolerance > 0
-        contention = np.sum([x.contention(len(base)) for x in found], axis=0) if tolerated else np.zeros(0)
+        contention = _contention(found, len(base)) if tolerated else [np.zeros(0)] * len(found)
         blocks: list[sparse.csr_array] = [sparse.csr_array((0, q.size + len(arrangement.c)))]
         parts: list[tuple[np.ndarray, ...]] = [(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))]
-        for x in found:
+        for x, claimed in zip(found, contention, strict=True):
             asked = x.margin[x.near.sample]
             if tolerated:
-                asked = asked - _USED * self.tolerance * x.shares(contention)
+                asked = asked - _USED * self.tolerance * x.shares(claimed)
             blocks.append(self.gradient(line, x.samples, x.near, x.states, arrangement))
             asked = np.where(x.touching, _TOUCHING, asked)
             parts.append((x.near.distance, asked, x.near.padding, ~x.touching))
@@ -244,18 +289,17 @@ class Collisions:
         out.eliminate_zeros()
         return out
 
-
-def _clearance(line: Polyline, base: Samples, near: Near) -> np.ndarray:
-    """Least distances (K - 1, 3) at the beginning, the middle and the end of every step, at most _NEAR."""
-    least = np.full(len(base), _NEAR)
-    mine = near.sample < len(base)
-    np.minimum.at(least, near.sample[mine], near.distance[mine])
-    out = np.full((line.knots - 1, 3), _NEAR)
-    own = base.segment == line.segment_of_step[base.lo] if len(base) else np.zeros(0, dtype=bool)
-    place = np.round(2 * base.t).astype(int)
-    np.minimum.at(out, (base.lo[own], place[own]), least[own])
-    # The end of a step is the beginning of the next, but where a transition happens in between.
-    of_step = line.segment_of_step
-    same = np.flatnonzero(of_step[1:] == of_step[:-1])
-    out[same, 2] = out[same + 1, 0]
-    return out
+    def _clearance(self, line: Polyline, base: Samples, near: Near) -> np.ndarray:
+        """Least distances (K - 1, pieces + 1) at equal intervals along every step, at most _NEAR."""
+        least = np.full(len(base), _NEAR)
+        mine = near.sample < len(base)
+        np.minimum.at(least, near.sample[mine], near.distance[mine])
+        out = np.full((line.knots - 1, self.pieces + 1), _NEAR)
+        own = base.segment == line.segment_of_step[base.lo] if len(base) else np.zeros(0, dtype=bool)
+        place = np.round(self.pieces * base.t).astype(int)
+        np.minimum.at(out, (base.lo[own], place[own]), least[own])
+        # The end of a step is the beginning of the next, but where a transition happens in between.
+        of_step = line.segment_of_step
+        same = np.flatnonzero(of_step[1:] == of_step[:-1])
+        out[same, -1] = out[same + 1, 0]
+        return out

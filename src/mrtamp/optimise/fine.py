@@ -17,6 +17,8 @@ _QUARTERS = np.array([0.25, 0.5, 0.75])
 _AROUND = np.array([-0.75, -0.5, -0.25, 0.25, 0.5, 0.75])
 _CLOSE = 1.5e-3
 """Distance (m) at which samples in between are looked at again more closely."""
+_TOLERATED = 0.98
+"""Share of the tolerated penetration beyond which a sample is refused: between samples it may be a little more."""
 _SWERVE = 1.3
 """By how much more than tracked points any other may move."""
 
@@ -26,10 +28,11 @@ Who = tuple[str, ...]
 
 @dataclass(frozen=True, eq=False)
 class Violations:
-    """Samples in collision, and who: a robot alone or two robots."""
+    """Samples (S,) in collision, and who: a robot alone or two robots; `depth` (S,) is what is beyond the tolerated."""
 
     who: Who
     samples: Samples
+    depth: np.ndarray
 
 
 def contact_of(stretches: Sequence[Stretch], robot: str, samples: Samples) -> np.ndarray:
@@ -51,19 +54,34 @@ class FineCheck:
 
     def __init__(self, nearness: Nearness, resolution: float = RESOLUTION) -> None:
         self.nearness = nearness
-        self.tolerance = nearness.collision.problem.collision.tolerance
+        self.tolerance = _TOLERATED * nearness.collision.problem.collision.tolerance
         self.resolution = resolution
+
+    def _points(self, robot: str, x: np.ndarray) -> np.ndarray:
+        """Where tracked points (n, P, 3) of a robot are in configurations x (n, N)."""
+        world = self.nearness.worlds[robot]
+        R, p = world.tool.pose(x)
+        hand = p[:, None] + np.einsum("nij,kj->nki", R, 0.1 * np.eye(3))
+        return np.concatenate([world.bounds.spheres(x), hand], axis=1)
 
     def _travel(self, line: Polyline, q: np.ndarray) -> dict[str, np.ndarray]:
         """How far (m) tracked points of every robot move in every step (K - 1,)."""
+        points = {r: self._points(r, q[:, columns]) for r, columns in line.columns.items()}
+        return {r: np.linalg.norm(np.diff(p, axis=0), axis=2).max(axis=1) for r, p in points.items()}
+
+    def left(
+        self, clearance: Mapping[Who, np.ndarray], line: Polyline, before: np.ndarray, after: np.ndarray
+    ) -> dict[Who, np.ndarray]:
+        """What is left at least of distances (K - 1, m + 1) along every step when knots move `before` -> `after`."""
+        moved = {}
+        for r, columns in line.columns.items():
+            away = self._points(r, after[:, columns]) - self._points(r, before[:, columns])
+            moved[r] = _SWERVE * np.linalg.norm(away, axis=2).max(axis=1)
         out = {}
-        for robot, columns in line.columns.items():
-            world = self.nearness.worlds[robot]
-            x = q[:, columns]
-            R, p = world.tool.pose(x)
-            hand = p[:, None] + np.einsum("nij,kj->nki", R, 0.1 * np.eye(3))
-            points = np.concatenate([world.bounds.spheres(x), hand], axis=1)
-            out[robot] = np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1)
+        for who, distance in clearance.items():
+            t = np.linspace(0, 1, distance.shape[1])
+            at = np.sum([moved[r] for r in who], axis=0)
+            out[who] = distance - (1 - t) * at[:-1, None] - t * at[1:, None]
         return out
 
     def _pieces(self, travel: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -95,8 +113,8 @@ class FineCheck:
         """All samples in collision; with `between`, of the samples in between the others, and more of a close call.
 
         Next to knots (K,) at which both of two robots are `pinned`, their shapes count without padding.  `clearance`
-        are distances (K - 1, 3) at the beginning, the middle and the end of every step: nothing that is further apart
-        at both ends of half a step than it moves in between is asked about.
+        are distances (K - 1, m + 1) at equal intervals along every step: nothing that is further apart at both ends of
+        an interval than it moves in between is asked about.
         """
         travel = self._travel(line, q)
         samples = self._samples(line, travel, between)
@@ -116,33 +134,52 @@ class FineCheck:
                 used,
                 self.nearness.state(robot, q[:, line.columns[robot]], samples[used], arrangement.modes),
             )
-        out = []
+        out, looked = [], []
+        total = np.zeros(len(samples))
         for who, all_of_them in doubtful.items():
             # Who stands still is looked at once.
-            mine = all_of_them[~np.all([still[r][all_of_them] for r in who], axis=0)]
+            stands = np.all([still[r] for r in who], axis=0)
+            mine = all_of_them[~stands[all_of_them]]
             if not len(mine):
                 continue
             self.nearness.collision.counts.collision_checks += len(mine)
             at = [state.of(np.searchsorted(used, mine)) for used, state in (states[r] for r in who)]
+            depth = np.zeros(len(samples))
             if len(who) == 1:
-                hits, suspects = self._world(line, who[0], at[0], samples[mine], arrangement)
-                if between and not len(hits) and len(suspects):
+                depth[mine], suspects = self._world(line, who[0], at[0], samples[mine], arrangement)
+                if between and len(suspects) and not np.any(depth[mine] > self.tolerance):
                     found = self._around(line, q, who[0], samples[mine[suspects]], arrangement, travel)
-                    out += [Violations(who, found)] if len(found) else []
+                    out += [found] if len(found.samples) else []
             else:
-                hits = self._pair(who, (at[0], at[1]), samples[mine], arrangement, pinned[who[0]] & pinned[who[1]])
+                tight = pinned[who[0]] & pinned[who[1]]
+                depth[mine] = self._pair(who, (at[0], at[1]), samples[mine], arrangement, tight)
+            if self.tolerance > 0:
+                depth = depth[np.maximum.accumulate(np.where(stands, 0, np.arange(len(samples))))]
+            total += depth
+            looked.append((who, depth))
+        beyond = total - self.tolerance
+        for who, depth in looked:
+            hits = np.flatnonzero((depth > 0) & (beyond > 0))
             if len(hits):
-                out.append(Violations(who, samples[mine[hits]]))
+                out.append(Violations(who, samples[hits], beyond[hits]))
         return out
 
     def _world(
-        self, line: Polyline, robot: str, state: State, samples: Samples, arrangement: Arrangement
+        self,
+        line: Polyline,
+        robot: str,
+        state: State,
+        samples: Samples,
+        arrangement: Arrangement,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Samples in collision, and samples so close to it that those around them are worth a look."""
+        """All penetrations together (S,) at every sample, and samples so close to one that those around them are worth
+        a look."""
         near = self.nearness.world(robot, state, samples, arrangement, _CLOSE)
         touching = self.nearness.touching(robot, contact_of(line.stretches, robot, samples), near)
-        depth = np.where(touching & (near.distance >= -CONTACT_DEPTH), 0.0, -near.distance)
-        return self._refused(near, depth, len(samples)), np.unique(near.sample[~touching])
+        lifted = touching & (near.distance >= -CONTACT_DEPTH)
+        depth = np.where(lifted, 0.0, -near.distance)
+        close = _total(near, np.where(touching, depth, depth + _CLOSE), len(samples)) > self.tolerance
+        return _total(near, depth, len(samples)), np.flatnonzero(close)
 
     def _around(
         self,
@@ -152,7 +189,7 @@ class FineCheck:
         samples: Samples,
         arrangement: Arrangement,
         travel: Mapping[str, np.ndarray],
-    ) -> Samples:
+    ) -> Violations:
         """What is in collision around samples of which every fourth was checked at the resolution."""
         pieces = self._pieces(travel)[samples.lo]
         t = (samples.t[:, None] + _AROUND / (4 * pieces[:, None])).ravel()
@@ -161,7 +198,9 @@ class FineCheck:
         more = Samples(np.repeat(samples.lo, repeat), t, np.repeat(samples.segment, repeat))[inside]
         self.nearness.collision.counts.collision_checks += len(more)
         state = self.nearness.state(robot, q[:, line.columns[robot]], more, arrangement.modes)
-        return more[self._world(line, robot, state, more, arrangement)[0]]
+        beyond = self._world(line, robot, state, more, arrangement)[0] - self.tolerance
+        hits = np.flatnonzero(beyond > 0)
+        return Violations((robot,), more[hits], beyond[hits])
 
     def _pair(
         self,
@@ -171,16 +210,17 @@ class FineCheck:
         arrangement: Arrangement,
         tight: np.ndarray,
     ) -> np.ndarray:
+        """All penetrations together (S,) at every sample."""
         near = self.nearness.between((who[0], who[1]), states, samples, arrangement, 0.0)
         lo, t = samples.lo, samples.t
         exact = (t == 0) | (t == 1) | tight[lo] | tight[np.minimum(lo + 1, len(tight) - 1)]
         bare = exact[near.sample] | (self.tolerance > 0)
-        return self._refused(near, -near.distance - np.where(bare, near.padding, 0.0), len(samples))
+        return _total(near, -near.distance - np.where(bare, near.padding, 0.0), len(samples))
 
-    def _refused(self, near: Near, depth: np.ndarray, n: int) -> np.ndarray:
-        """Samples of n at which all penetrations together are more than is tolerated."""
-        total = np.bincount(near.sample, weights=np.maximum(depth, 0.0), minlength=n)
-        return np.flatnonzero(total > self.tolerance)
+
+def _total(near: Near, depth: np.ndarray, n: int) -> np.ndarray:
+    """The sum of penetrations `depth` (P,) at each of n samples."""
+    return np.bincount(near.sample, weights=np.maximum(depth, 0.0), minlength=n)
 
 
 def _still(x: np.ndarray, samples: Samples) -> np.ndarray:
@@ -191,11 +231,12 @@ def _still(x: np.ndarray, samples: Samples) -> np.ndarray:
 
 
 def _doubtful(line: Polyline, samples: Samples, clearance: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Samples that the distances at the ends of their half of a step do not settle."""
-    half = (samples.t > 0.5).astype(int)
-    apart = clearance[samples.lo, half] + clearance[samples.lo, half + 1]
+    """Samples that the distances at the ends of their interval of a step do not settle."""
+    m = clearance.shape[1] - 1
+    k = np.minimum((m * samples.t).astype(int), m - 1)
+    apart = clearance[samples.lo, k] + clearance[samples.lo, k + 1]
     own = samples.segment == line.segment_of_step[samples.lo]
-    return np.flatnonzero(~own | (apart <= _SWERVE * moved[samples.lo] / 2))
+    return np.flatnonzero(~own | (apart <= _SWERVE * moved[samples.lo] / m))
 
 
 def knot_samples(line: Polyline, pieces: np.ndarray) -> Samples:

@@ -75,6 +75,10 @@ class Near:
     b: np.ndarray
     padding: np.ndarray
 
+    def of(self, index: np.ndarray) -> Near:
+        """Some of the pairs."""
+        return Near(*(x[index] for x in vars(self).values()))
+
 
 class Situations(Protocol):
     """What is held and what rests where, by the numbers of segments."""

@@ -8,7 +8,7 @@ strata, checks the result as finely as the planner does, and keeps it if it is c
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
@@ -18,7 +18,9 @@ from mrtamp.optimise.choices import Arrangement, Choices
 from mrtamp.optimise.closure import Closure, Rows, independent
 from mrtamp.optimise.collisions import CollisionRows, Collisions
 from mrtamp.optimise.fine import FineCheck, Violations, Who
-from mrtamp.optimise.nearness import Nearness
+from mrtamp.optimise.iterate import Iterate
+from mrtamp.optimise.mending import CLEARANCE, Mending
+from mrtamp.optimise.nearness import Nearness, Samples
 from mrtamp.optimise.pins import pins
 from mrtamp.optimise.polyline import Polyline, load
 from mrtamp.optimise.program import PENALTY, Linearised, Reduction, reduce, solve
@@ -55,16 +57,6 @@ _PATIENCE = 6
 _EPS = 1e-9
 _WINDOW, _WORTH, _FINER = 8, 2e-3, 4.0
 """Steps within which the best cost and the current merit have to fall by that share; by how much less when finer."""
-
-
-@dataclass(frozen=True, eq=False)
-class Iterate:
-    """A polyline and what is attached to what along it."""
-
-    line: Polyline
-    q: np.ndarray
-    arrangement: Arrangement
-    cost: float
 
 
 class Optimiser:
@@ -117,6 +109,7 @@ class Optimiser:
         self.converged = False
         self._stalls = 0
         self._grazing = 0
+        self.mending = Mending(self.nearness, self.fine, problem.collision.tolerance, self._solve, self._violations)
         self._last_chances = _CHANCES
         self._trail: list[float] = []
         self._worth = np.inf
@@ -170,16 +163,22 @@ class Optimiser:
         self.trust = max(self.trust, 4 * _SMALLEST)
         self._return_to(refused)
         bounds = [0, *refused.line.events.tolist()]
+        slipped: list[Violations] = []
         for violation in report.violations:
             who = self._guilty(violation, refused.arrangement)
             if who and violation.kind == "collision":
-                s = violation.segment or 0
+                s, t, depth = violation.segment or 0, violation.fraction or 0.0, violation.value or 0.0
                 lo = min(bounds[s] + (violation.step or 0), refused.line.knots - 2)
-                self.collisions.demand(who, lo, violation.fraction or 0.0, s, violation.value or 0.0)
+                self.collisions.demand(who, lo, t, s, depth)
+                where = Samples(np.array([lo]), np.array([t]), np.array([s]))
+                slipped.append(Violations(who, where, np.array([depth])))
             elif self.slide:
                 # Not a matter of clearance: leave transitions as they were.
                 self._fix()
                 return
+        mended = self._mended(refused, slipped) if slipped else None
+        if mended is not None:
+            self._best = self._now = mended
 
     def _guilty(self, violation: Violation, arrangement: Arrangement) -> Who:
         held = arrangement.modes[violation.segment or 0].held
@@ -223,7 +222,7 @@ class Optimiser:
         if self._rows is None:
             self._rows = self.collisions.rows(now.line, now.q, now.arrangement)
         self.steps += 1
-        solved = self._solve(now, self._rows)
+        solved = self._solve(now, self._rows, self.trust)
         if solved is None:
             return self._reject()
         demands = self.collisions.demands
@@ -250,22 +249,34 @@ class Optimiser:
         self._now = candidate
         if candidate.line is not now.line:
             self._adopt(candidate)
-        clean = deepest < _SHALLOW
-        if clean:
-            violations = self._violations(candidate, rows)
-            clean = not violations
-            if violations:
-                rows = rows.joined(self.collisions.more(*where, self.collisions.learn(violations)))
-        after = self._merit(candidate, rows)
+        violations = self._violations(candidate, rows.clearance) if deepest < _SHALLOW else []
+        clean = deepest < _SHALLOW and not violations
+        if violations:
+            rows = rows.joined(self.collisions.more(*where, self.collisions.learn(violations)))
+        falling = candidate.cost < (1 - _GAINING) * now.cost
+        gaining = falling and np.isfinite(self.cost)
+        mended = self._mended(candidate, violations) if violations and not falling else None
+        if mended is None:
+            after = self._merit(candidate, rows)
+        else:
+            self._now, clean = mended, True
+            # What can be mended has to keep hardly any distance before, nowhere.
+            self.collisions.forget()
+            self.collisions.margin = CLEARANCE
+            rows = self.collisions.rows(mended.line, mended.q, mended.arrangement)
+            before, after = self._best.cost if np.isfinite(self.cost) else now.cost, mended.cost
+        candidate = self._now
         self._rows, self._worth = rows, after
         gain = 0.0
         if clean and candidate.cost < self._best.cost - _EPS:
             gain = self._best.cost - candidate.cost
             self._best = candidate
         self._clear_up(clean)
-        gaining = np.isfinite(self.cost) and candidate.cost < (1 - _GAINING) * now.cost
         self._pace(before, after, self._promise + self._changes, clean, gaining)
         return gain
+
+    def _mended(self, x: Iterate, violations: Sequence[Violations]) -> Iterate | None:
+        return self.mending.attempt(x, violations, self._best.cost, self.collisions.level)
 
     def _looked_at(self, solved: Iterate) -> tuple[Iterate, CollisionRows, np.ndarray]:
         """What a program leads to, its knots spread evenly where steps have become too long; its collision rows, and
@@ -339,22 +350,28 @@ class Optimiser:
         self._settle(self.trust < _SMALLEST)
         return 0.0
 
-    def _violations(self, x: Iterate, rows: CollisionRows) -> list[Violations]:
-        """Samples in collision; what may become the best is looked at four times as closely."""
-        found = self.fine.violations(x.line, x.q, x.arrangement, self._pinned, rows.clearance)
-        if found or x.cost >= self._best.cost - _EPS:
+    def _violations(
+        self, x: Iterate, clearance: Mapping[Who, np.ndarray], thoroughly: bool = False
+    ) -> list[Violations]:
+        """Samples in collision; what may become the best is looked at four times as closely.
+
+        `thoroughly`: even where the first look has found some.
+        """
+        where = x.line, x.q, x.arrangement, self._pinned, clearance
+        found = self.fine.violations(*where)
+        if x.cost >= self._best.cost - _EPS or (found and not thoroughly):
             return found
-        return self.fine.violations(x.line, x.q, x.arrangement, self._pinned, rows.clearance, between=True)
+        return found + self.fine.violations(*where, between=True)
 
     def _merit(self, x: Iterate, rows: CollisionRows) -> float:
         return x.cost + PENALTY * float(np.maximum(-rows.gap, 0.0).sum())
 
-    def _solve(self, now: Iterate, rows: CollisionRows) -> Iterate | None:
+    def _solve(self, now: Iterate, rows: CollisionRows, trust: float) -> Iterate | None:
         E, size = self._reduction.E, now.q.size
         n, count = E.shape[1], self.choices.count
         scale = self.choices.scale
         whole = sparse.csr_array(sparse.block_diag([E, sparse.diags_array(scale)])) if count else E
-        lower, upper = self._box(now)
+        lower, upper = self._box(now, trust)
         equal = self._stacked(self._closure.equalities(now.q, now.arrangement), n + count)[0]
         F, g = self._stacked(self._closure.inequalities(now.q, now.arrangement), n + count)
         linear = Linearised(sparse.csr_array(rows.A @ whole), -rows.gap, equal, F, g, lower, upper)
@@ -369,20 +386,20 @@ class Optimiser:
         projected = self._closure.project(self._clipped(q), arrangement)
         return None if projected is None else self._iterate(now.line, self._clipped(projected), arrangement)
 
-    def _box(self, now: Iterate) -> tuple[np.ndarray, np.ndarray]:
+    def _box(self, now: Iterate, trust: float) -> tuple[np.ndarray, np.ndarray]:
         """Trust region, joint limits and bounds of coordinates."""
         low, high = self._limits
         at = now.q[self._reduction.knot, self._reduction.column]
         column = self._reduction.column
-        lower = np.clip(low[column] - at, -self.trust, 0.0)
-        upper = np.clip(high[column] - at, 0.0, self.trust)
+        lower = np.clip(low[column] - at, -trust, 0.0)
+        upper = np.clip(high[column] - at, 0.0, trust)
         if not self.choices.count:
             return lower, upper
         least, most = self.choices.bounds
         c, scale = now.arrangement.c, self.choices.scale
         return (
-            np.concatenate([lower, np.clip((least - c) / scale, -self.trust, 0.0)]),
-            np.concatenate([upper, np.clip((most - c) / scale, 0.0, self.trust)]),
+            np.concatenate([lower, np.clip((least - c) / scale, -trust, 0.0)]),
+            np.concatenate([upper, np.clip((most - c) / scale, 0.0, trust)]),
         )
 
     def _stacked(self, parts: Sequence[Rows], n: int) -> tuple[sparse.csr_array, np.ndarray]:

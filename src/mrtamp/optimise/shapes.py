@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from pydrake.geometry import Box, Capsule, GeometryId, HalfSpace, SceneGraphInspector, Sphere
+from pydrake.geometry import Box, Capsule, Cylinder, GeometryId, HalfSpace, SceneGraphInspector, Sphere
 
 from mrtamp.collision import geometry_bound
 from mrtamp.optimise.rounded import Solids, beyond, signed_distances
@@ -68,7 +68,7 @@ class Shapes:
         self.ids: list[GeometryId] = []
         R: list[np.ndarray] = []
         p: list[np.ndarray] = []
-        sizes: list[tuple[np.ndarray, float, float]] = []
+        sizes: list[tuple[np.ndarray, float, float, bool]] = []
 
         def add(found: list[tuple[GeometryId, int]]) -> _Group:
             first = len(self.ids)
@@ -100,13 +100,13 @@ class Shapes:
         ]
         X = np.array(poses).reshape(-1, 4, 4)
         self._fixed = _carried(self._static, (X[None, :, :3, :3], X[None, :, :3, 3]), np.arange(len(X)))
-        self._half = np.array([half for half, _, _ in sizes]).reshape(-1, 3)
-        self._radius = np.array([radius for _, radius, _ in sizes])
-        self._bound = np.array([bound for _, _, bound in sizes])
+        self._half = np.array([half for half, _, _, _ in sizes]).reshape(-1, 3)
+        self._radius = np.array([radius for _, radius, _, _ in sizes])
+        self._bound = np.array([bound for _, _, bound, _ in sizes])
         index = {g: i for i, g in enumerate(self.ids)}
         pairs = [(index[a], index[b]) for a, b in inspector.GetCollisionCandidates() if a in index and b in index]
         both = np.array(sorted((min(x), max(x)) for x in pairs), dtype=int).reshape(-1, 2)
-        known = np.isfinite(self._radius)
+        known = np.array([exact for _, _, _, exact in sizes], dtype=bool)
         mine = known[both].all(axis=1)
         self._pairs, self._others = both[mine], both[~mine]
         self.foreign = {g for g, k in zip(self.ids, known.tolist(), strict=True) if not k}
@@ -143,7 +143,13 @@ class Shapes:
 
     def unsettled(self, poses: Poses, reach: float) -> np.ndarray:
         """Samples at which something that is no rounded box may be within `reach` (m) of something else."""
-        return np.unique(self._within(poses[1], self._others, reach)[0])
+        R, p = poses
+        s, c = self._within(p, self._others, reach)
+        i, j = self._others[c].T
+        a, b = (Solids(self._half[k], self._radius[k], R[s, k], p[s, k]) for k in (i, j))
+        endless = ~np.isfinite(self._bound[i] + self._bound[j])
+        apart = (beyond(a, b) > reach) | (beyond(b, a) > reach)
+        return np.unique(s[endless | ~apart])
 
     def _within(self, p: np.ndarray, pairs: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
         """Samples and numbers of the pairs whose bounding spheres come within `reach` (m)."""
@@ -168,10 +174,9 @@ def _carried(group: _Group, poses: Poses, body: np.ndarray) -> Poses:
 
 def _rounded(
     scene: Scene, inspector: SceneGraphInspector, g: GeometryId
-) -> tuple[np.ndarray, tuple[np.ndarray, float, float]]:
-    """Pose (4, 4) of a geometry in its body, half size (3,) and radius of the rounded box, radius around its centre.
-
-    The radius of the box is not finite where a geometry is none; the pose is then that of its bounding sphere.
+) -> tuple[np.ndarray, tuple[np.ndarray, float, float, bool]]:
+    """Pose (4, 4) of a geometry in its body; half size (3,) and radius of a rounded box, radius around its centre, and
+    whether the geometry is that box.  Otherwise it is somewhere in it, unless it has no end.
     """
     X = inspector.GetPoseInFrame(g).GetAsMatrix4()
     shape = inspector.GetShape(g)
@@ -182,10 +187,13 @@ def _rounded(
     elif isinstance(shape, Box):
         half, radius = np.asarray(shape.size()) / 2, 0.0
     elif isinstance(shape, HalfSpace):
-        return X, (np.zeros(3), np.inf, np.inf)
+        return X, (np.zeros(3), 0.0, np.inf, False)
+    elif isinstance(shape, Cylinder):
+        half = np.array([shape.radius(), shape.radius(), shape.length() / 2])
+        return X, (half, 0.0, float(np.hypot(shape.radius(), shape.length() / 2)), False)
     else:
         centre, bound = geometry_bound(scene, [g])
         X = np.eye(4)
         X[:3, 3] = centre
-        return X, (np.zeros(3), np.inf, bound)
-    return X, (half, radius, float(np.linalg.norm(half)) + radius)
+        return X, (np.zeros(3), bound, bound, False)
+    return X, (half, radius, float(np.linalg.norm(half)) + radius, True)

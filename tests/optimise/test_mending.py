@@ -1,0 +1,102 @@
+"""Mending: what grazes something is freed close by, at a cost little above its own; what is deep inside is left."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from discs import RADIUS, Errands, disc_problem
+from gantry import gantry_problem, valid_plan
+from pydrake.math import RigidTransform
+from test_optimiser import discs, judged
+from test_rows import optimiser
+
+from mrtamp.optimise import Optimiser
+from mrtamp.optimise.collisions import Collisions
+from mrtamp.optimise.fine import Violations
+from mrtamp.optimise.iterate import Iterate
+from mrtamp.plan import Plan
+from mrtamp.problem import CollisionRules, RobotAt, Shape, StaticBody
+
+
+def around(folder: Path, inside: float) -> Plan:
+    """A disc goes around the end of a wall in two straight motions, each of which is that deep (m) in it."""
+    wall = StaticBody("wall", RigidTransform([-1.0, 0, 0.05]), Shape("box", (2.0, 0.002, 0.1)))
+    problem = discs(folder, statics=(wall,), goal=(RobotAt("a", np.array([-0.5, 0.5])),))
+    # The line from (-0.5, -0.5) to (x, 0) passes the wall's end, the origin, at that distance.
+    square = (RADIUS - inside) ** 2
+    x = max(np.roots([0.25 - square, -square, -0.5 * square]).tolist())
+    return Errands(problem).move(a=(x, 0.0)).move(a=(-0.5, 0.5)).plan()
+
+
+def looked_at(scp: Optimiser) -> tuple[Iterate, list[Violations]]:
+    now = scp._now
+    return now, scp._violations(now, scp.collisions.rows(now.line, now.q, now.arrangement).clearance, True)
+
+
+@pytest.mark.parametrize("inside", [0.001, 0.004, 0.012])
+def test_a_graze_is_mended_close_by(tmp_path: Path, inside: float) -> None:
+    scp = optimiser(around(tmp_path, inside), draft=True)
+    base, found = looked_at(scp)
+    deepest = max(float(v.depth.max()) for v in found)
+    assert deepest == pytest.approx(inside, abs=2e-3)
+    mended = scp.mending.attempt(base, found, np.inf)
+    assert mended is not None
+    assert np.abs(mended.q - base.q).max() <= 0.02 + 1e-9
+    assert mended.cost <= base.cost + 3 * inside + 2e-3
+    scp._best = scp._now = mended
+    assert judged(scp).ok
+
+
+def test_what_is_deep_inside_or_no_cheaper_is_left_alone(tmp_path: Path) -> None:
+    scp = optimiser(around(tmp_path, 0.06), draft=True)
+    base, found = looked_at(scp)
+    assert scp.mending.attempt(base, found, np.inf) is None
+    scp = optimiser(around(tmp_path, 0.004), draft=True)
+    base, found = looked_at(scp)
+    assert scp.mending.attempt(base, found, base.cost) is None, "no gain"
+    solve, scp.mending.solve = scp.mending.solve, lambda *_: None
+    assert scp.mending.attempt(base, found, np.inf) is None, "no program is solved"
+    scp.mending.solve = solve
+    tried = [scp.mending.attempt(base, found, np.inf) is not None for _ in range(3)]
+    assert tried == [False, False, True], "after an attempt in vain not at once"
+
+
+def test_distances_that_are_left_are_lower_bounds(tmp_path: Path) -> None:
+    scp = optimiser(valid_plan(gantry_problem(tmp_path)))
+    now, rng = scp._now, np.random.default_rng(0)
+    rules = Collisions(scp.nearness, 0.0, pieces=8, reach=0.02)
+
+    def measured(q: np.ndarray) -> dict:
+        return rules.rows(now.line, q, now.arrangement).clearance
+
+    before, q = measured(now.q), now.q
+    tight = 0
+    for scale in (0.002, 0.01, 0.02):
+        after = q + rng.uniform(-scale, scale, q.shape)
+        left, true = scp.fine.left(before, now.line, q, after), measured(after)
+        for who in true:
+            assert np.all(left[who] <= true[who] + 1e-6), who
+            tight += int(np.count_nonzero(left[who] > true[who] - 0.01))
+    assert tight > 100, "and not much lower than they are"
+
+
+def test_penetrations_of_all_robots_together_are_what_is_tolerated(tmp_path: Path) -> None:
+    """Disc a is 6 mm in the wall and 6 mm in disc b, which has come to stand there first and does not move any more."""
+
+    def found(tolerance: float) -> list[Violations]:
+        problem = replace(
+            discs(tmp_path, statics=disc_problem(tmp_path).statics), collision=CollisionRules((), tolerance)
+        )
+        # The wall's face is at y = -0.05.
+        y = -0.05 - RADIUS + 0.006
+        distance = 2 * RADIUS - 0.006
+        x = 0.1 - float(np.sqrt(distance**2 - 0.1**2))
+        plan = Errands(problem).move(b=(0.1, y - 0.1)).move(a=(x - 0.3, y)).move(a=(x, y)).plan()
+        return looked_at(optimiser(plan, draft=True))[1]
+
+    assert not found(0.0125)
+    assert {v.who for v in found(0.011)} == {("a",), ("a", "b")}
+    assert max(float(v.depth.max()) for v in found(0.011)) == pytest.approx(0.0012, abs=4e-4)
