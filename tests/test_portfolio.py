@@ -13,7 +13,7 @@ from mrtamp.check import check_plan
 from mrtamp.options import Skeleton
 from mrtamp.plan import Plan
 from mrtamp.planner import Options, Planner
-from mrtamp.portfolio import SIZE
+from mrtamp.portfolio import _PATIENCE, SIZE, Portfolio, _Entry
 from mrtamp.skeleton_guidance import Proposal
 
 STARTS: Mapping[str, XY] = {"a": (-1, 1), "b": (-1, -1)}
@@ -147,3 +147,49 @@ def test_what_the_same_search_finds_takes_the_place_of_what_has_hardly_begun(tmp
     assert not portfolio.add(between, similar=True), "it has come too late"
     assert portfolio.add(between), "what another search finds may be different in other ways"
     assert len(portfolio._entries) == 2
+
+
+def test_what_was_not_judged_is_no_plan_before_the_judge_accepts_it(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    portfolio, begun = planner.portfolio, roundabout(planner, 0.6)
+    assert portfolio.add_unchecked(begun.segments, begun.transitions)
+    assert not portfolio.add_unchecked(begun.segments, begun.transitions), "it is known"
+    [entry] = portfolio._entries
+    assert entry.draft and not entry.began_as_draft and not portfolio.nearing(2 * begun.cost)
+    found = [plan for plan in (portfolio.improve(begun.cost) for _ in range(8)) if plan is not None]
+    assert found and all(check_plan(plan).ok for plan in found)
+    assert not entry.draft
+
+
+def test_small_gains_wait_for_the_judge_until_several_programs_have_passed(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    entry = _Entry(roundabout(planner, 0.6))
+    gains = [0.1, 0.0, *(_PATIENCE + 2) * [0.005]]
+    due = [Portfolio._due(entry, entry.cost * (1 + gain)) for gain in gains]
+    assert due == [True, False, *_PATIENCE * [False], True, False]
+
+
+def test_what_most_likely_goes_the_wrong_way_around_does_not_hold_up_others(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    portfolio, plan = planner.portfolio, roundabout(planner, 0.6)
+    portfolio.add(plan)
+    [entry] = portfolio._entries
+    assert portfolio.converging(plan.cost, plan.cost), "it has its trial"
+    entry.optimiser = portfolio._optimiser(entry)
+    entry.optimiser.steps = 10
+    assert portfolio.converging(plan.cost, 0.9 * plan.cost)
+    assert not portfolio.converging(plan.cost, 0.5 * plan.cost)
+    assert not portfolio.converging(0.5 * plan.cost, plan.cost), "it will not beat the incumbent"
+
+
+def test_what_a_round_has_gained_in_the_end_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even where the judge would not have been asked for so little yet."""
+    planner = planner_for(tmp_path)
+    portfolio, plan = planner.portfolio, roundabout(planner, 0.6)
+    portfolio.add(plan)
+    monkeypatch.setattr(Portfolio, "_due", lambda *_: False)
+    found = None
+    while found is None and not portfolio._entries[0].done:
+        found = portfolio.improve(plan.cost)
+    assert found is not None and found.cost < plan.cost
+    assert portfolio._entries[0].plan is found

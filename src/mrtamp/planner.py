@@ -260,7 +260,7 @@ class Planner:
         busy = refine and self.portfolio.busy
         if refine and not self.skeletons.has_choice:
             # Others would only be other motions of the same ways: they wait until those there are have converged.
-            skeletons = skeletons and not self.portfolio.converging(to_beat)
+            skeletons = skeletons and not self._one_at_a_time()
             busy = busy or self.portfolio.nearing(to_beat)
         elif skeletons and refine and self.realisation.undrafted:
             return "skeletons"
@@ -270,6 +270,11 @@ class Planner:
             *(["refinement"] if refine else []),
         ]
         return self._effort.next(available, eager="refinement" if busy else None)
+
+    def _one_at_a_time(self) -> bool:
+        """Whether other motions of the same ways wait for those under refinement to converge."""
+        bound = self.skeletons.bound or np.inf
+        return not self.skeletons.has_choice and self.portfolio.converging(self._to_beat(), bound)
 
     def _uses(self, mechanism: str) -> bool:
         return mechanism not in self.options.without
@@ -353,6 +358,8 @@ class Planner:
 
     def _found(self, plan: Plan, *, similar: bool = False) -> bool:
         """There is a plan: it is refined, and from now on the tree is rewired; whether it is a new one."""
+        if not self.skeletons.has_choice:
+            self.portfolio.without_choice()
         new = not self._uses("refinement") or self.portfolio.add(plan, similar=similar)
         # Skeletons that only lead to known plans are asked for ever more rarely.
         self._stale = 0 if new else min(self._stale + 1, _RAREST)
@@ -371,6 +378,9 @@ class Planner:
 
     def _best_solution(self) -> None:
         """Extract the cheapest plan of the tree when it beats what the tree gave before."""
+        if self.best is not None and self._one_at_a_time():
+            # It would only be another motion of the same ways.
+            return
         while True:
             growth = self.growth
             growth.goal_nodes = [n for n in growth.goal_nodes if n.alive]

@@ -12,7 +12,7 @@ from mrtamp.incumbent import Incumbent
 from mrtamp.optimise import Optimiser
 from mrtamp.optimise.nearness import Nearness
 from mrtamp.optimise.yielding import Draft, Yielding
-from mrtamp.plan import Plan, Transition
+from mrtamp.plan import Plan, Segment, Transition
 from mrtamp.problem import Problem
 from mrtamp.refine import Refiner
 from mrtamp.transitions.sampler import TransitionSampler
@@ -27,25 +27,45 @@ _ALONE = 1200
 """The same where there is no convex programming."""
 _STALE = 0.004
 """Relative gain of a turn below which shortening has done its part."""
-_TRIAL, _FAST = 5, 0.03
+_TRIAL, _FAST, _SLOWLY = 5, 0.03, 0.01
 """Conic programs that a plan gets before it is compared with the others, and more as long as each makes it cheaper by
-that share."""
-_HOPELESS = 1.12
-"""Plans that cost so many times the incumbent after their trial wait until nothing else is left to do."""
+that share, or at least by that of them (see `_Patience`)."""
 _LUCK = 0.93
 """A draft may come to so many times less than the best one so far, relative to what their skeletons promised."""
 _NEARLY = 0.97
 """A plan whose current iterate costs less than the incumbent times this goes on until it is free of collision."""
 _LATELY, _CRAWL = 5, 0.01
 """Conic programs over which a first round has to gain that share to go on."""
-_ROUNDS = 3
-"""Times that a finished plan is shaken and refined again without gain before it is left alone."""
+_ASTRAY = 1.4
+"""A plan that costs so many times the least that is possible most likely goes the wrong way around."""
 _ALIKE = 0.02
 """Relative difference of cost below which two plans with the same order of events are held to be alike."""
 _EPS = 1e-9
 """By how much the costs of a plan and of the polyline that it was made from may differ."""
 WORTH_CHECKING = 0.002
 """Relative gain over the incumbent that is worth a check."""
+
+_PLENTY, _PATIENCE = 0.01, 4
+"""Relative gain that is checked at once, and programs after which a smaller one is."""
+
+
+@dataclass(frozen=True)
+class _Patience:
+    """How much work a plan gets.
+
+    slow : number of programs up to which its trial goes on even if it becomes cheaper slowly.
+    hopeless : if it costs so many times the best after its trial it waits until nothing else is left to do.
+    rounds : times that it is shaken and refined again without gain before it is left alone.
+    """
+
+    slow: int
+    hopeless: float
+    rounds: int
+
+
+_OTHER_WAYS = _Patience(slow=0, hopeless=1.12, rounds=3)
+_SAME_WAYS = _Patience(slow=12, hopeless=1.01, rounds=1)
+"""Where there is no choice of ways, all plans come near to each other, and other motions promise more than rounds."""
 
 
 @dataclass(eq=False)
@@ -72,6 +92,9 @@ class _Entry:
     """Cost when this round began."""
     trail: list[float] = field(default_factory=list)
     """Outlook after every conic program of this round."""
+    patience: _Patience = _OTHER_WAYS
+    waiting: int = 0
+    """Conic programs since it has been worth a check."""
 
     @property
     def cost(self) -> float:
@@ -91,11 +114,17 @@ class _Entry:
         return self.rounds == 0 and clean and len(trail) == _LATELY and trail[0] - trail[-1] < _CRAWL * trail[-1]
 
     @property
+    def over(self) -> bool:
+        """Whether convex programming has come to the end of this round."""
+        return self.optimiser is not None and (self.optimiser.converged or self.optimiser.stuck or self.slow)
+
+    @property
     def on_trial(self) -> bool:
         if self.done or self.optimiser is None:
             return not self.done
-        falling = len(self.trail) > 1 and self.trail[-1] < (1 - _FAST) * self.trail[-2]
-        return self.optimiser.steps < _TRIAL or falling
+        steps = self.optimiser.steps
+        least = _SLOWLY if steps < self.patience.slow else _FAST
+        return steps < _TRIAL or (len(self.trail) > 1 and self.trail[-1] < (1 - least) * self.trail[-2])
 
     @property
     def began_as_draft(self) -> bool:
@@ -113,20 +142,14 @@ class _Entry:
 
     @property
     def goes_ahead(self) -> bool:
-        """Whether, as the incumbent, it has its turns before others: a draft from its trial to the end of its second
-        round, where re-timing and finer steps gain most."""
+        """Whether, as the incumbent, it has its turns before others: from its trial to the end of its second round,
+        where re-timing and finer steps gain most, if it began as a draft or there is no choice of ways."""
         begun = self.rounds == 1 or (self.rounds == 0 and not self.on_trial)
-        return begun and self.began_as_draft
+        return begun and (self.began_as_draft or self.patience is _SAME_WAYS)
 
     def is_near(self, incumbent: float) -> bool:
         """Whether it is about to beat the incumbent clearly."""
         return bool(self.trail) and self.outlook < _NEARLY * incumbent
-
-    def hopeless(self, incumbent: float, most: float) -> bool:
-        """Whether it is a draft to give up: its estimate is above `most`, where no draft so far has ended cheap enough,
-        or its trial left it no cheaper than the incumbent, and to come free costs it more still.
-        """
-        return self.draft and (self.estimate > most or (not self.on_trial and self.outlook >= incumbent))
 
 
 class Portfolio:
@@ -157,6 +180,9 @@ class Portfolio:
         """The least that a draft has cost in the end, relative to its estimate."""
         self.drafted = False
         """Whether what was worked on last came from a draft and has not converged since."""
+        self.patience = _OTHER_WAYS
+        self._coarse = 0.0
+        """The least that a plan has cost after its first round, where there is no choice of ways."""
         self.nearness = Nearness(validity.collision)
         self.yielding = Yielding(problem, self.nearness)
 
@@ -174,7 +200,19 @@ class Portfolio:
             return False
         self._seen.add(round(plan.cost, 6))
         self._entries = [e for e in self._entries if not (e in fresh and e.on_trial)]
-        self._admit([_Entry(plan)])
+        self._admit([_Entry(plan, patience=self.patience)])
+        return True
+
+    def add_unchecked(self, segments: list[Segment], transitions: list[Transition]) -> bool:
+        """Put motions under refinement of which the judge has not been asked: what may have slipped between samples is
+        mended sooner than found; False if they are known."""
+        plan = self.incumbent.plan(segments, transitions)
+        if round(plan.cost, 6) in self._seen:
+            return False
+        self._seen.add(round(plan.cost, 6))
+        entry = _Entry(plan, draft=True, patience=self.patience)
+        entry.optimiser = self._optimiser(entry)
+        self._admit([entry])
         return True
 
     def shortened(self, plan: Plan, proposals: int) -> Plan:
@@ -205,7 +243,7 @@ class Portfolio:
                 continue
             self._seen.add(round(plan.cost, 6))
             free = self.incumbent.accepted(draft.segments, draft.transitions) if draft.conflict == 0.0 else None
-            entry = _Entry(free or plan, draft=free is None, estimate=estimate)
+            entry = _Entry(free or plan, draft=free is None, estimate=estimate, patience=self.patience)
             entry.optimiser = self._optimiser(entry)
             fresh.append(entry)
         self._admit(fresh[::-1])
@@ -229,13 +267,18 @@ class Portfolio:
         self.drafted = entry is not None and entry.fresh_draft
         if entry is None:
             return None
+        if entry.optimiser is None and self.convex and entry.rounds == 0 and entry.resolution == RESOLUTION:
+            # Shortening gains far less in the time.
+            entry.before = entry.plan.cost
+            entry.optimiser = self._optimiser(entry)
         if entry.optimiser is None:
             return self._shorten(entry, incumbent)
         entry.optimiser.step()
         entry.trail.append(entry.optimiser.outlook)
-        plan = self._offer(entry, incumbent, entry.optimiser)
-        if entry.optimiser.converged or entry.slow or entry.optimiser.stuck:
-            self._finish(entry)
+        due = self._due(entry, incumbent) or entry.over
+        plan = self._offer(entry, incumbent, entry.optimiser) if due else None
+        if entry.over:
+            self._finish(entry, incumbent)
         return plan
 
     @property
@@ -243,9 +286,22 @@ class Portfolio:
         """Whether a plan is on trial: until it is over, more plans would only wait."""
         return any(e.on_trial for e in self._entries)
 
-    def converging(self, incumbent: float) -> bool:
-        """Whether a plan that may beat `incumbent` has not converged for the first time."""
-        return any(e.fresh and (e.on_trial or e.outlook < _HOPELESS * incumbent) for e in self._entries)
+    def without_choice(self) -> None:
+        """From now on plans are other motions of the same ways."""
+        self.patience = _SAME_WAYS
+
+    def converging(self, incumbent: float, bound: float) -> bool:
+        """Whether a plan that may beat `incumbent`, or is it, is yet to converge; no plan costs less than `bound`."""
+        return any(
+            (e.fresh and (e.on_trial or (self._hopeful(e, incumbent) and e.outlook < _ASTRAY * bound)))
+            or (e.goes_ahead and e.cost <= incumbent + _EPS and e.outlook < _ASTRAY * bound)
+            for e in self._entries
+        )
+
+    def _hopeful(self, entry: _Entry, incumbent: float) -> bool:
+        """Whether a plan may still beat the incumbent; later rounds take off all plans about the same."""
+        best = max(incumbent, self._coarse) if entry.rounds <= 1 else incumbent
+        return entry.outlook < self.patience.hopeless * best
 
     def nearing(self, incumbent: float) -> bool:
         """Whether a plan is about to beat `incumbent` clearly."""
@@ -258,7 +314,11 @@ class Portfolio:
 
     def idle(self, incumbent: float) -> bool:
         """Whether no plan promises a gain any more."""
-        return all(e.done and (e.fruitless >= _ROUNDS or e.cost >= _HOPELESS * incumbent) for e in self._entries)
+        return all(e.done and not self._worth_a_round(e, incumbent) for e in self._entries)
+
+    def _worth_a_round(self, entry: _Entry, incumbent: float) -> bool:
+        """Whether a plan that has converged is shaken and refined again."""
+        return entry.done and entry.fruitless < self.patience.rounds and self._hopeful(entry, incumbent)
 
     def _choose(self, incumbent: float) -> _Entry | None:
         """One that is about to beat the incumbent; else the incumbent itself if it `goes_ahead`; else one on trial, the
@@ -268,7 +328,7 @@ class Portfolio:
         Drafts that are `hopeless` are given up.
         """
         most = self.worth_drafting(incumbent) if self._share else np.inf
-        self._entries = [e for e in self._entries if not e.hopeless(incumbent, most)]
+        self._entries = [e for e in self._entries if not (e.draft and self._hopeless(e, incumbent, most))]
         near = [e for e in self._entries if e.is_near(incumbent)]
         if near:
             return min(near, key=lambda e: e.outlook)
@@ -278,14 +338,24 @@ class Portfolio:
         trial = [e for e in self._entries if e.on_trial]
         if trial:
             return trial[-1]
-        going = [e for e in self._entries if not e.done and e.outlook < _HOPELESS * incumbent]
+        going = [e for e in self._entries if not e.done and self._hopeful(e, incumbent)]
         if going:
             return min(going, key=lambda e: e.outlook)
         waiting = [e for e in self._entries if not e.done]
-        rested = [e for e in self._entries if e.done and e.fruitless < _ROUNDS and e.cost < _HOPELESS * incumbent]
+        rested = [e for e in self._entries if self._worth_a_round(e, incumbent)]
         if rested:
             return self._again(min(rested, key=lambda e: e.cost * (1 + 0.02 * e.fruitless)))
         return min(waiting, key=lambda e: e.cost, default=None)
+
+    def _hopeless(self, draft: _Entry, incumbent: float, most: float) -> bool:
+        """Whether to give up a draft: its estimate is above `most`, where no draft so far has ended cheap enough,
+        or its trial left it no cheaper than the incumbent, and to come free costs it more still.
+
+        What is only unchecked has nothing more to pay.
+        """
+        if draft.on_trial or not draft.began_as_draft:
+            return draft.estimate > most or not (draft.on_trial or self._hopeful(draft, incumbent))
+        return draft.estimate > most or draft.outlook >= incumbent
 
     @staticmethod
     def _again(entry: _Entry) -> _Entry:
@@ -311,7 +381,7 @@ class Portfolio:
         if self.convex:
             self._begin_convex(entry, entry.refiner, judged=plan is not None)
         else:
-            self._finish(entry)
+            self._finish(entry, incumbent)
         return plan
 
     def _begin_convex(self, entry: _Entry, work: Refiner, *, judged: bool) -> None:
@@ -339,9 +409,12 @@ class Portfolio:
             level=min(entry.rounds, 1),
         )
 
-    def _finish(self, entry: _Entry) -> None:
+    def _finish(self, entry: _Entry, incumbent: float) -> None:
         """Convergence: what was gained decides whether the plan is worth another round; a draft is given up."""
         work = entry.optimiser
+        if entry.draft and not self._hopeful(entry, incumbent):
+            self._entries.remove(entry)
+            return
         if work is not None and np.isfinite(work.cost) and (entry.draft or work.cost < entry.plan.cost - _EPS):
             plan = self.incumbent.accepted(work.segments(), work.transitions)
             if plan is not None:
@@ -349,9 +422,12 @@ class Portfolio:
         if entry.draft:
             self._entries.remove(entry)
             return
-        if entry.fresh_draft:
+        if entry.began_as_draft:
+            # The second round, too, often gains much.
             share = entry.plan.cost / entry.estimate
             self._share = min(self._share or share, share)
+        if entry.rounds == 0 and self.patience is _SAME_WAYS:
+            self._coarse = min(self._coarse or entry.plan.cost, entry.plan.cost)
         gained = entry.before - entry.plan.cost > WORTH_CHECKING * entry.plan.cost
         entry.fruitless = 0 if gained else entry.fruitless + 1
         entry.rounds += 1
@@ -382,6 +458,15 @@ class Portfolio:
             entry.resolution /= 2
             entry.refiner = None
         return None
+
+    @staticmethod
+    def _due(entry: _Entry, incumbent: float) -> bool:
+        """Whether the judge is asked now: that takes longer than a program, and the next may gain as much again."""
+        entry.waiting = entry.waiting + 1 if entry.cost <= incumbent * (1 - WORTH_CHECKING) else 0
+        due = entry.waiting > _PATIENCE or entry.cost <= incumbent * (1 - _PLENTY)
+        if due:
+            entry.waiting = 0
+        return due
 
     def _refiner(self, entry: _Entry) -> Refiner:
         return Refiner(entry.plan, self.validity, self.rng, entry.resolution)

@@ -25,8 +25,9 @@ _FIRST_WAYS, _MORE_WAYS = (80, 14), (64, 20)
 """IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
 _FIRST_SHORTENED, _SHORTENED = 16, 40
 """Of these, how many are shortened."""
-_GROWTHS, _WORTH_GROWING = 3, 0.02
-"""Before the first drafts ways are sampled up to so many times, as long as skeletons get cheaper by that share."""
+_GROWTHS, _SLOW_GROWTHS, _WORTH_GROWING = 3, 2, 0.02
+"""Before the first drafts ways are sampled up to so many times, fewer where that takes long since objects are handed
+over, as long as skeletons get cheaper by that share."""
 _REALISATIONS = 6
 """Skeletons that are tried at a time."""
 _QUICK, _THOROUGH = 30, 300
@@ -124,6 +125,10 @@ class Realisation:
                     continue
                 tries += 1
                 best = self._cheapest_insertion(proposal)
+                if best is not None and not first and self.portfolio.convex and not self.skeletons.has_choice:
+                    self.skeletons.realised(proposal)
+                    self.portfolio.add_unchecked(*best[1])
+                    return None
                 if best is not None:
                     inserted.append((*best, proposal))
                     if first or len(inserted) == _RIVALS or not self.skeletons.has_choice:
@@ -177,7 +182,8 @@ class Realisation:
                 self.skeletons.shorten(self.descent, _FIRST_SHORTENED)
             return
         cheapest = np.inf
-        for _ in range(_GROWTHS if self.undrafted else 1):
+        most = _SLOW_GROWTHS if self.skeletons.hands_over else _GROWTHS
+        for _ in range(most if self.undrafted else 1):
             before, cheapest = cheapest, self._more_ways()
             if cheapest > (1 - _WORTH_GROWING) * before:
                 break
