@@ -6,6 +6,8 @@ points. Tests that need it are skipped elsewhere.
 
 import json
 import os
+import subprocess
+import sys
 import time
 from functools import cache
 from pathlib import Path
@@ -366,6 +368,14 @@ def test_excepted_links_never_meet_on_the_real_arm() -> None:
 
 @needs_official
 def test_one_check_takes_at_most_two_thirds_of_the_official_models_time() -> None:
+    # In a process of its own: what earlier tests have left in memory slows down what both models have in common.
+    done = subprocess.run([sys.executable, __file__], capture_output=True, text=True, check=True)
+    ours, official = map(float, done.stdout.split())
+    assert ours <= 2 / 3 * official
+
+
+def times_of_one_check() -> tuple[float, float]:
+    """Seconds that a check of two arms takes, with our model and with the official one."""
     poses = [RigidTransform([-0.5, 0, 0]), RigidTransform(RotationMatrix.MakeZRotation(np.pi), [0.5, 0, 0])]
     scenes = [Scene(description, poses, table=True, cubes=6) for description in (OURS, OFFICIAL)]
     for scene in scenes:
@@ -373,8 +383,7 @@ def test_one_check_takes_at_most_two_thirds_of_the_official_models_time() -> Non
             scene.plant.SetFreeBodyPose(scene.context, cube, RigidTransform([0, 0.2 * k - 0.5, 0.025]))
 
     def seconds(scene: Scene, q: np.ndarray) -> float:
-        # The best of three: what else the machine is doing only ever adds. Setting the positions again makes
-        # Drake forget the poses, so each of the three is a whole check.
+        # Setting the positions again makes Drake forget the poses, so each of the three is a whole check.
         best = np.inf
         for _ in range(3):
             for arm in range(2):
@@ -386,13 +395,14 @@ def test_one_check_takes_at_most_two_thirds_of_the_official_models_time() -> Non
         return best
 
     rng = np.random.default_rng(5)
-    ratios = []
+    configurations = np.array(scenes[0].robot["home"]) + rng.uniform(-0.8, 0.8, (400, 2, 7))
+    # What else the machine is doing only ever adds: of every configuration the best time counts.
+    best = np.full((len(configurations), 2), np.inf)
     for _ in range(5):
-        times = []
-        for _ in range(400):
-            q = np.array(scenes[0].robot["home"]) + rng.uniform(-0.8, 0.8, (2, 7))
-            times.append([seconds(scene, q) for scene in scenes])
-        ours, official = np.median(times, axis=0)
-        ratios.append(ours / official)
-    # The median over repetitions: a burst of load on the machine spoils one of them, not three.
-    assert np.median(ratios) <= 2 / 3, ratios
+        best = np.minimum(best, [[seconds(scene, q) for scene in scenes] for q in configurations])
+    ours, official = np.median(best, axis=0)
+    return float(ours), float(official)
+
+
+if __name__ == "__main__":
+    print(*times_of_one_check())
