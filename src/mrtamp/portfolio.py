@@ -70,7 +70,7 @@ _SAME_WAYS = _Patience(slow=12, hopeless=1.01, rounds=1)
 
 @dataclass(eq=False)
 class _Entry:
-    """A checked plan and what works on it: shortening first, then convex programming.
+    """A checked plan and what works on it: convex programming, in later rounds after some shortening.
 
     A draft is no plan yet: its robots still collide with each other, and convex programs have to pull them apart.
     """
