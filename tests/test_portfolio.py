@@ -193,3 +193,14 @@ def test_what_a_round_has_gained_in_the_end_is_not_lost(tmp_path: Path, monkeypa
         found = portfolio.improve(plan.cost)
     assert found is not None and found.cost < plan.cost
     assert portfolio._entries[0].plan is found
+
+
+def test_patience_follows_the_choice_there_is(tmp_path: Path) -> None:
+    """Ways may be found later for what had only one."""
+    planner = planner_for(tmp_path)
+    portfolio = planner.portfolio
+    for height, choice in ((0.9, False), (0.4, True), (-0.1, False)):
+        portfolio.suit(choice=choice)
+        assert portfolio.add(roundabout(planner, height))
+    rounds = [e.patience.rounds for e in portfolio._entries]
+    assert rounds[0] == rounds[2] < rounds[1]

@@ -358,8 +358,7 @@ class Planner:
 
     def _found(self, plan: Plan, *, similar: bool = False) -> bool:
         """There is a plan: it is refined, and from now on the tree is rewired; whether it is a new one."""
-        if not self.skeletons.has_choice:
-            self.portfolio.without_choice()
+        self.portfolio.suit(choice=self.skeletons.has_choice)
         new = not self._uses("refinement") or self.portfolio.add(plan, similar=similar)
         # Skeletons that only lead to known plans are asked for ever more rarely.
         self._stale = 0 if new else min(self._stale + 1, _RAREST)

@@ -44,7 +44,6 @@ _EPS = 1e-9
 """By how much the costs of a plan and of the polyline that it was made from may differ."""
 WORTH_CHECKING = 0.002
 """Relative gain over the incumbent that is worth a check."""
-
 _PLENTY, _PATIENCE = 0.01, 4
 """Relative gain that is checked at once, and programs after which a smaller one is."""
 
@@ -286,9 +285,9 @@ class Portfolio:
         """Whether a plan is on trial: until it is over, more plans would only wait."""
         return any(e.on_trial for e in self._entries)
 
-    def without_choice(self) -> None:
-        """From now on plans are other motions of the same ways."""
-        self.patience = _SAME_WAYS
+    def suit(self, *, choice: bool) -> None:
+        """From now on plans may use different ways; without `choice` they are other motions of the same ones."""
+        self.patience = _OTHER_WAYS if choice else _SAME_WAYS
 
     def converging(self, incumbent: float, bound: float) -> bool:
         """Whether a plan that may beat `incumbent`, or is it, is yet to converge; no plan costs less than `bound`."""
@@ -325,7 +324,7 @@ class Portfolio:
         newest first; else one that goes on.
 
         What drafts seem to cost before their first program says nothing: those on trial begin with the most promising.
-        Drafts that are `hopeless` are given up.
+        Drafts that are hopeless are given up.
         """
         most = self.worth_drafting(incumbent) if self._share else np.inf
         self._entries = [e for e in self._entries if not (e.draft and self._hopeless(e, incumbent, most))]
@@ -353,9 +352,11 @@ class Portfolio:
 
         What is only unchecked has nothing more to pay.
         """
-        if draft.on_trial or not draft.began_as_draft:
-            return draft.estimate > most or not (draft.on_trial or self._hopeful(draft, incumbent))
-        return draft.estimate > most or draft.outlook >= incumbent
+        if draft.estimate > most:
+            return True
+        if draft.on_trial:
+            return False
+        return draft.outlook >= incumbent if draft.began_as_draft else not self._hopeful(draft, incumbent)
 
     @staticmethod
     def _again(entry: _Entry) -> _Entry:

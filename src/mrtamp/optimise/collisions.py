@@ -212,7 +212,7 @@ class Collisions:
     # -- rows -------------------------------------------------------------------------------------------------------
 
     def rows(self, line: Polyline, q: np.ndarray, arrangement: Arrangement) -> CollisionRows:
-        """Distances and their gradients at knots, midpoints, and wherever they were demanded, at knots q (K, N)."""
+        """Distances and their gradients at samples of all steps, and wherever they were demanded, at knots q (K, N)."""
         return self._rows(line, q, arrangement, knot_samples(line, np.full(line.knots - 1, self.pieces)), self.demands)
 
     def more(self, line: Polyline, q: np.ndarray, arrangement: Arrangement, demands: Demands) -> CollisionRows:

@@ -165,12 +165,7 @@ class FineCheck:
         return out
 
     def _world(
-        self,
-        line: Polyline,
-        robot: str,
-        state: State,
-        samples: Samples,
-        arrangement: Arrangement,
+        self, line: Polyline, robot: str, state: State, samples: Samples, arrangement: Arrangement
     ) -> tuple[np.ndarray, np.ndarray]:
         """All penetrations together (S,) at every sample, and samples so close to one that those around them are worth
         a look."""

@@ -13,12 +13,10 @@ import numpy as np
 
 from mrtamp.optimise.collisions import CollisionRows, Collisions
 from mrtamp.optimise.fine import FineCheck, Violations, Who
-from mrtamp.optimise.iterate import Iterate
-from mrtamp.optimise.nearness import Nearness
+from mrtamp.optimise.iterate import Iterate, worth
 
-_MENDABLE, _WORTH, _FINER = 0.02, 2e-3, 4.0
-"""Penetration (m) between samples up to which an iterate can be mended, by what share cheaper it then has to be, and by
-how much less that is at every finer level."""
+_MENDABLE = 0.02
+"""Penetration (m) between samples up to which an iterate can be mended."""
 _PROGRAMS, _NEARBY = 6, 0.02
 """Programs that an iterate is mended by, and their trust region (rad or m)."""
 _LESS, _LITTLE = 0.7, 1e-3
@@ -41,14 +39,13 @@ class Mending:
 
     Parameters
     ----------
-    nearness, tolerance : of the problem.
     fine : knows what is left of distances when knots move.
+    tolerance : penetration (m) that the problem tolerates at an instant.
     solve : solves one program.
     look : finds collisions.
     """
 
-    def __init__(self, nearness: Nearness, fine: FineCheck, tolerance: float, solve: Solve, look: Look) -> None:
-        self.nearness = nearness
+    def __init__(self, fine: FineCheck, tolerance: float, solve: Solve, look: Look) -> None:
         self.fine = fine
         self.tolerance = tolerance
         self.solve = solve
@@ -59,7 +56,7 @@ class Mending:
         """An iterate close to `base`, which has these violations, that is free of collision and costs less than `best`;
         None where none is found, or it is not worth looking for at this `level`."""
         self._pause = max(self._pause - 1, 0)
-        if self._pause or _deepest(violations) >= _MENDABLE or base.cost >= (1 - _WORTH / _FINER**level) * best:
+        if self._pause or _deepest(violations) >= _MENDABLE or base.cost >= (1 - worth(level)) * best:
             return None
         mended = self._mended(base, violations, best, level)
         if mended is None:
@@ -69,7 +66,7 @@ class Mending:
     def _mended(self, base: Iterate, violations: Sequence[Violations], best: float, level: int) -> Iterate | None:
         where = base.line, base.q, base.arrangement
         rules = Collisions(
-            self.nearness, self.tolerance, pieces=_PIECES, reach=_REACH, margin=CLEARANCE, stricter=CLEARANCE
+            self.fine.nearness, self.tolerance, pieces=_PIECES, reach=_REACH, margin=CLEARANCE, stricter=CLEARANCE
         )
         rules.level = level
         rows, found, depth = rules.rows(*where), list(violations), np.inf

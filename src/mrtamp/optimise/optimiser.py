@@ -18,7 +18,7 @@ from mrtamp.optimise.choices import Arrangement, Choices
 from mrtamp.optimise.closure import Closure, Rows, independent
 from mrtamp.optimise.collisions import CollisionRows, Collisions
 from mrtamp.optimise.fine import FineCheck, Violations, Who
-from mrtamp.optimise.iterate import Iterate
+from mrtamp.optimise.iterate import Iterate, worth
 from mrtamp.optimise.mending import CLEARANCE, Mending
 from mrtamp.optimise.nearness import Nearness, Samples
 from mrtamp.optimise.pins import pins
@@ -55,8 +55,8 @@ _CHANCES = 4
 _STALL = 1e-3
 _PATIENCE = 6
 _EPS = 1e-9
-_WINDOW, _WORTH, _FINER = 8, 2e-3, 4.0
-"""Steps within which the best cost and the current merit have to fall by that share; by how much less when finer."""
+_WINDOW = 8
+"""Steps within which the best cost and the current merit have to fall by what is worth having."""
 
 
 class Optimiser:
@@ -109,7 +109,7 @@ class Optimiser:
         self.converged = False
         self._stalls = 0
         self._grazing = 0
-        self.mending = Mending(self.nearness, self.fine, problem.collision.tolerance, self._solve, self._violations)
+        self.mending = Mending(self.fine, problem.collision.tolerance, self._solve, self._violations)
         self._last_chances = _CHANCES
         self._trail: list[float] = []
         self._worth = np.inf
@@ -329,7 +329,7 @@ class Optimiser:
         self._trail.append(self._best.cost + self._worth)
         if len(self._trail) > _WINDOW:
             first, last = self._trail[-_WINDOW - 1], self._trail[-1]
-            done = done or first - last < _WORTH / _FINER**level * last
+            done = done or first - last < worth(level) * last
         if done and level < self.levels:
             self.collisions.level += 1
             self.collisions.forget()
