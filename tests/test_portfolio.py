@@ -19,11 +19,11 @@ from mrtamp.skeleton_guidance import Proposal
 STARTS: Mapping[str, XY] = {"a": (-1, 1), "b": (-1, -1)}
 
 
-def planner_for(folder: Path, robots: str = "ab") -> Planner:
+def planner_for(folder: Path, robots: str = "ab", *without: str) -> Planner:
     """Every disc has to visit the other side of the square."""
     subgoals = [visit(f"{r} there", r, (1, STARTS[r][1])) for r in robots]
     problem = arena(folder, {r: STARTS[r] for r in robots}, subgoals=subgoals)
-    return Planner(problem, options=Options(initial_vertices=5))
+    return Planner(problem, options=Options(initial_vertices=5, without=frozenset(without)))
 
 
 def roundabout(planner: Planner, height: float) -> Plan:
@@ -165,7 +165,7 @@ def test_small_gains_wait_for_the_judge_until_several_programs_have_passed(tmp_p
     planner = planner_for(tmp_path)
     entry = _Entry(roundabout(planner, 0.6))
     gains = [0.1, 0.0, *(_PATIENCE + 2) * [0.005]]
-    due = [Portfolio._due(entry, entry.cost * (1 + gain)) for gain in gains]
+    due = [planner.portfolio._due(entry, entry.cost * (1 + gain)) for gain in gains]
     assert due == [True, False, *_PATIENCE * [False], True, False]
 
 
@@ -202,5 +202,63 @@ def test_patience_follows_the_choice_there_is(tmp_path: Path) -> None:
     for height, choice in ((0.9, False), (0.4, True), (-0.1, False)):
         portfolio.suit(choice=choice)
         assert portfolio.add(roundabout(planner, height))
-    rounds = [e.patience.rounds for e in portfolio._entries]
-    assert rounds[0] == rounds[2] < rounds[1]
+    slow = [e.patience.slow for e in portfolio._entries]
+    assert slow[0] == slow[2] > slow[1]
+
+
+def test_what_has_converged_goes_on_beside_what_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many plans come, those that are refined further have their share of the turns, and they have theirs."""
+    planner = planner_for(tmp_path)
+    portfolio, best = planner.portfolio, roundabout(planner, 0.6)
+    portfolio.add(best)
+    [entry] = portfolio._entries
+    while entry.rounds < 2:
+        best = portfolio.improve(best.cost) or best
+    monkeypatch.setattr(Portfolio, "_worth_a_round", lambda self, e, incumbent: e is entry and e.done)
+    # The incumbent is as cheap as it gets: neither gains anything.
+    turns, heights = {False: 0, True: 0}, iter(0.9 - 0.001 * k for k in range(1000))
+    for _ in range(60):
+        if not any(e.fresh for e in portfolio._entries):
+            portfolio._seen.clear()
+            portfolio._entries = [entry]
+            portfolio._admit([_Entry(roundabout(planner, next(heights)))])
+        worked: list[_Entry] = []
+        choose = Portfolio._choose
+
+        def chosen(self: Portfolio, incumbent: float, choose=choose, worked=worked) -> _Entry | None:
+            worked.append(choose(self, incumbent))
+            return worked[-1]
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Portfolio, "_choose", chosen)
+            best = portfolio.improve(best.cost) or best
+        turns[worked[0] is entry] += 1
+    assert min(turns.values()) >= 10, turns
+
+
+def test_what_was_gained_is_judged_before_time_is_up(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    portfolio = planner.portfolio
+    entry = _Entry(roundabout(planner, 0.6))
+    portfolio.incumbent.judging_s = 1.0
+    for left, due in ((None, False), (60.0, False), (2.0, True)):
+        portfolio.deadline.set(left)
+        assert portfolio._due(entry, entry.cost * 1.005) is due
+        assert not portfolio._due(entry, entry.cost), "nothing was gained"
+
+
+@pytest.mark.parametrize(
+    ("without", "searched", "fineness"),
+    [((), [2, 4, 6], [0, 1, 2, 2, 3, 3, 4]), (("local-search",), [], [0, 1, 2, 3, 4, 5, 6])],
+)
+@pytest.mark.parametrize("choice", [True, False])
+def test_rounds_of_local_search_and_of_finer_programs_take_turns(
+    tmp_path: Path, choice: bool, without: tuple[str, ...], searched: list[int], fineness: list[int]
+) -> None:
+    portfolio = (planner := planner_for(tmp_path, "ab", *without)).portfolio
+    portfolio.suit(choice=choice)
+    plan = roundabout(planner, 0.6)
+    rounds = [_Entry(plan, rounds=k, patience=portfolio.patience) for k in range(7)]
+    assert [e.rounds for e in rounds if e.searches] == searched
+    assert [e.fineness for e in rounds] == fineness
+    assert [e.rounds for e in rounds if e.goes_ahead] == ([] if choice else [1, 2])

@@ -33,6 +33,11 @@ class Deadline:
         self.end = np.inf if budget_s is None else time.perf_counter() + budget_s
 
     @property
+    def left_s(self) -> float:
+        """Seconds until time is up; infinite where it never is."""
+        return self.end - time.perf_counter()
+
+    @property
     def passed(self) -> bool:
         """Whether time is up."""
         return time.perf_counter() >= self.end

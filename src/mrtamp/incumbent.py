@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import time
 from importlib.metadata import version
 
 from mrtamp.check import Checker, Report
@@ -22,6 +23,8 @@ class Incumbent:
         self.best: Plan | None = None
         self.refused = 0
         self.last_refusal = ""
+        self.judging_s = 0.0
+        """Seconds that the judge took for the last plan."""
         self._history: list[dict[str, float]] = []
         self._checker = Checker(problem)
 
@@ -39,7 +42,9 @@ class Incumbent:
 
     def judge(self, plan: Plan) -> Report:
         """The independent judge's report."""
+        began = time.perf_counter()
         report = self._checker.check(plan)
+        self.judging_s = time.perf_counter() - began
         if not report.ok:
             self.refused += 1
             self.last_refusal = str(report.violations[0])

@@ -149,8 +149,10 @@ class Planner:
             self.sampler,
             self.incumbent,
             self.rng,
+            deadline=self.deadline,
             convex=self._uses("convex-programming"),
             sliding=self._uses("sliding"),
+            local=self._uses("local-search"),
         )
         self.realisation = Realisation(
             self.growth,

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mrtamp.collision import RESOLUTION
+from mrtamp.deadline import Deadline
+from mrtamp.effort import Effort
 from mrtamp.incumbent import Incumbent
-from mrtamp.optimise import Optimiser
+from mrtamp.optimise import LocalSearch, Optimiser
 from mrtamp.optimise.nearness import Nearness
 from mrtamp.optimise.yielding import Draft, Yielding
 from mrtamp.plan import Plan, Segment, Transition
@@ -34,8 +36,8 @@ _LUCK = 0.93
 """A draft may come to so many times less than the best one so far, relative to what their skeletons promised."""
 _NEARLY = 0.97
 """A plan whose current iterate costs less than the incumbent times this goes on until it is free of collision."""
-_LATELY, _CRAWL = 5, 0.01
-"""Conic programs over which a first round has to gain that share to go on."""
+_CRAWL = 0.01
+"""Share that a first round has to gain in so many programs as `_Patience` says to go on."""
 _ASTRAY = 1.4
 """A plan that costs so many times the least that is possible most likely goes the wrong way around."""
 _ALIKE = 0.02
@@ -44,8 +46,16 @@ _EPS = 1e-9
 """By how much the costs of a plan and of the polyline that it was made from may differ."""
 WORTH_CHECKING = 0.002
 """Relative gain over the incumbent that is worth a check."""
-_PLENTY, _PATIENCE = 0.01, 4
-"""Relative gain that is checked at once, and programs after which a smaller one is."""
+_PLENTY, _PATIENCE, _LONGER = 0.01, 4, 24
+"""Relative gain that is checked at once, and programs after which a smaller one is: more of them where they are small
+ones of local search."""
+
+_ROUNDS = 6
+"""Rounds without gain after which a plan is left alone."""
+_FIRST, _LATER = "first rounds", "later rounds"
+"""What turns go to: plans that have not converged, and those that are shaken and refined again."""
+_LAST = 3.0
+"""When there is no more time than the judge takes so many times, what was gained is checked at once."""
 
 
 @dataclass(frozen=True)
@@ -54,17 +64,28 @@ class _Patience:
 
     slow : number of programs up to which its trial goes on even if it becomes cheaper slowly.
     hopeless : if it costs so many times the best after its trial it waits until nothing else is left to do.
-    rounds : times that it is shaken and refined again without gain before it is left alone.
+    lately : number of programs in which a first round has to gain something to go on.
+    shares : least shares of first and of later rounds; as long as neither gains anything first ones have what is left.
+    same_ways : whether there is no choice of ways.
+    local : whether, from the third on, every other round is local search.
     """
 
     slow: int
     hopeless: float
-    rounds: int
+    lately: int
+    shares: tuple[float, float]
+    same_ways: bool = False
+    local: bool = True
+
+    def effort(self) -> Effort:
+        """Shares out turns to first and later rounds."""
+        first, later = self.shares
+        return Effort({_FIRST: first, _LATER: later}, {_FIRST: 1.0, _LATER: 0.0})
 
 
-_OTHER_WAYS = _Patience(slow=0, hopeless=1.12, rounds=3)
-_SAME_WAYS = _Patience(slow=12, hopeless=1.01, rounds=1)
-"""Where there is no choice of ways, all plans come near to each other, and other motions promise more than rounds."""
+_OTHER_WAYS = _Patience(slow=0, hopeless=1.12, lately=5, shares=(0.5, 0.2))
+_SAME_WAYS = _Patience(slow=12, hopeless=1.01, lately=3, shares=(0.2, 0.6), same_ways=True)
+"""Where there is no choice of ways, all plans come near to each other, and bends promise more than other motions."""
 
 
 @dataclass(eq=False)
@@ -80,7 +101,7 @@ class _Entry:
     """What its skeleton was to cost, if it began as a draft."""
     resolution: float = RESOLUTION
     refiner: Refiner | None = None
-    optimiser: Optimiser | None = None
+    optimiser: Optimiser | LocalSearch | None = None
     proposals: int = 0
     done: bool = False
     rounds: int = 0
@@ -108,9 +129,10 @@ class _Entry:
     @property
     def slow(self) -> bool:
         """Whether a first round gains so little that other plans are worth more; later rounds go on to the end."""
-        trail = self.trail[-_LATELY:]
+        lately = self.patience.lately
+        trail = self.trail[-lately:]
         clean = self.optimiser is not None and self.optimiser.cost <= (1 + _CRAWL) * self.outlook
-        return self.rounds == 0 and clean and len(trail) == _LATELY and trail[0] - trail[-1] < _CRAWL * trail[-1]
+        return self.rounds == 0 and clean and len(trail) == lately and trail[0] - trail[-1] < _CRAWL * trail[-1]
 
     @property
     def over(self) -> bool:
@@ -119,8 +141,11 @@ class _Entry:
 
     @property
     def on_trial(self) -> bool:
-        if self.done or self.optimiser is None:
-            return not self.done
+        """Whether it has begun only just, or gains much with every program of its first round."""
+        if self.rounds or self.done:
+            return False
+        if self.optimiser is None:
+            return True
         steps = self.optimiser.steps
         least = _SLOWLY if steps < self.patience.slow else _FAST
         return steps < _TRIAL or (len(self.trail) > 1 and self.trail[-1] < (1 - least) * self.trail[-2])
@@ -128,6 +153,11 @@ class _Entry:
     @property
     def began_as_draft(self) -> bool:
         return bool(np.isfinite(self.estimate))
+
+    @property
+    def size(self) -> int:
+        """Number of knots that a turn works on."""
+        return self.optimiser.knots if self.optimiser is not None else sum(s.length for s in self.plan.segments)
 
     @property
     def fresh(self) -> bool:
@@ -141,10 +171,23 @@ class _Entry:
 
     @property
     def goes_ahead(self) -> bool:
-        """Whether, as the incumbent, it has its turns before others: from its trial to the end of its second round,
-        where re-timing and finer steps gain most, if it began as a draft or there is no choice of ways."""
-        begun = self.rounds == 1 or (self.rounds == 0 and not self.on_trial)
-        return begun and (self.began_as_draft or self.patience is _SAME_WAYS)
+        """Whether, as the incumbent, it has its turns before others: from its trial to the end of its first round of
+        finer steps, which with re-timing gain most, if it began as a draft; and to the end of its first local search
+        where there is no choice of ways.
+        """
+        same = self.patience.same_ways
+        begun = 0 < self.rounds <= (2 if same else 1) or (self.rounds == 0 and not self.on_trial)
+        return begun and (self.began_as_draft or same)
+
+    @property
+    def fineness(self) -> int:
+        """How often convex programs for the whole plan have converged."""
+        return self.rounds - (max(self.rounds - 1, 0) // 2 if self.patience.local else 0)
+
+    @property
+    def searches(self) -> bool:
+        """Whether its round is local search."""
+        return self.patience.local and self.rounds > 0 and self.rounds % 2 == 0
 
     def is_near(self, incumbent: float) -> bool:
         """Whether it is about to beat the incumbent clearly."""
@@ -162,24 +205,31 @@ class Portfolio:
         incumbent: Incumbent,
         rng: np.random.Generator,
         *,
+        deadline: Deadline | None = None,
         convex: bool = True,
         sliding: bool = True,
+        local: bool = True,
     ) -> None:
         self.problem = problem
         self.validity = validity
         self.sampler = sampler
         self.incumbent = incumbent
         self.rng = rng
+        self.deadline = deadline or Deadline()
         self.convex = convex
         self.sliding = sliding
+        self._patiences = [replace(p, local=local) for p in (_OTHER_WAYS, _SAME_WAYS)]
         self._entries: list[_Entry] = []
         self._settled: list[Plan] = []
         self._seen: set[float] = set()
+        self._contest: str | None = None
+        """Which of the two had its turn last, where there was a choice."""
         self._share = 0.0
         """The least that a draft has cost in the end, relative to its estimate."""
         self.drafted = False
         """Whether what was worked on last came from a draft and has not converged since."""
-        self.patience = _OTHER_WAYS
+        self.patience = self._patiences[0]
+        self._effort = self.patience.effort()
         self._coarse = 0.0
         """The least that a plan has cost after its first round, where there is no choice of ways."""
         self.nearness = Nearness(validity.collision)
@@ -266,10 +316,21 @@ class Portfolio:
         self.drafted = entry is not None and entry.fresh_draft
         if entry is None:
             return None
+        plan = self._work(entry, incumbent)
+        if self._contest is not None:
+            gain = incumbent - plan.cost if plan is not None else 0.0
+            self._effort.record(self._contest, entry.size, max(gain, 0.0))
+        return plan
+
+    def _work(self, entry: _Entry, incumbent: float) -> Plan | None:
+        """A turn of one plan."""
         if entry.optimiser is None and self.convex and entry.rounds == 0 and entry.resolution == RESOLUTION:
             # Shortening gains far less in the time.
             entry.before = entry.plan.cost
             entry.optimiser = self._optimiser(entry)
+        if entry.optimiser is None and entry.refiner is None and self.convex and entry.searches:
+            entry.before = entry.plan.cost
+            entry.optimiser = self._local_search(entry)
         if entry.optimiser is None:
             return self._shorten(entry, incumbent)
         entry.optimiser.step()
@@ -287,7 +348,9 @@ class Portfolio:
 
     def suit(self, *, choice: bool) -> None:
         """From now on plans may use different ways; without `choice` they are other motions of the same ones."""
-        self.patience = _OTHER_WAYS if choice else _SAME_WAYS
+        patience = self._patiences[0 if choice else 1]
+        if patience is not self.patience:
+            self.patience, self._effort = patience, patience.effort()
 
     def converging(self, incumbent: float, bound: float) -> bool:
         """Whether a plan that may beat `incumbent`, or is it, is yet to converge; no plan costs less than `bound`."""
@@ -317,15 +380,16 @@ class Portfolio:
 
     def _worth_a_round(self, entry: _Entry, incumbent: float) -> bool:
         """Whether a plan that has converged is shaken and refined again."""
-        return entry.done and entry.fruitless < self.patience.rounds and self._hopeful(entry, incumbent)
+        return entry.done and entry.fruitless < _ROUNDS and self._hopeful(entry, incumbent)
 
     def _choose(self, incumbent: float) -> _Entry | None:
-        """One that is about to beat the incumbent; else the incumbent itself if it `goes_ahead`; else one on trial, the
-        newest first; else one that goes on.
+        """One that is about to beat the incumbent; else the incumbent itself if it `goes_ahead`; else, as the shares of
+        both have it, one in its first round, the newest first, or one in a later round.
 
         What drafts seem to cost before their first program says nothing: those on trial begin with the most promising.
         Drafts that are hopeless are given up.
         """
+        self._contest = None
         most = self.worth_drafting(incumbent) if self._share else np.inf
         self._entries = [e for e in self._entries if not (e.draft and self._hopeless(e, incumbent, most))]
         near = [e for e in self._entries if e.is_near(incumbent)]
@@ -334,16 +398,19 @@ class Portfolio:
         ahead = next((e for e in self._entries if e.goes_ahead and e.cost <= incumbent + _EPS), None)
         if ahead is not None:
             return self._again(ahead) if ahead.done else ahead
+        hopeful = [e for e in self._entries if not e.done and self._hopeful(e, incumbent)]
         trial = [e for e in self._entries if e.on_trial]
-        if trial:
-            return trial[-1]
-        going = [e for e in self._entries if not e.done and self._hopeful(e, incumbent)]
-        if going:
-            return min(going, key=lambda e: e.outlook)
-        waiting = [e for e in self._entries if not e.done]
+        first = trial[-1] if trial else min((e for e in hopeful if e.fresh), key=lambda e: e.outlook, default=None)
+        begun = [e for e in hopeful if e.rounds]
         rested = [e for e in self._entries if self._worth_a_round(e, incumbent)]
-        if rested:
-            return self._again(min(rested, key=lambda e: e.cost * (1 + 0.02 * e.fruitless)))
+        later = min(begun or rested, key=lambda e: e.cost * (1 + 0.02 * e.fruitless), default=None)
+        if first is not None and later is not None:
+            self._contest = self._effort.next((_FIRST, _LATER))
+        if first is not None and self._contest != _LATER:
+            return first
+        if later is not None:
+            return self._again(later) if later.done else later
+        waiting = [e for e in self._entries if not e.done]
         return min(waiting, key=lambda e: e.cost, default=None)
 
     def _hopeless(self, draft: _Entry, incumbent: float, most: float) -> bool:
@@ -406,9 +473,14 @@ class Portfolio:
             slide=self.sliding,
             draft=entry.draft,
             # Finer steps beside bends gain little: they wait until a plan has proved itself.
-            levels=entry.rounds,
-            level=min(entry.rounds, 1),
+            levels=entry.fineness,
+            level=min(entry.fineness, 1),
         )
+
+    def _local_search(self, entry: _Entry) -> LocalSearch:
+        # A piece is small enough for finer steps, which with coarse ones all around gain as much.
+        plan = entry.plan
+        return LocalSearch(self.problem, self.nearness, plan.segments, plan.transitions, self.rng, level=1)
 
     def _finish(self, entry: _Entry, incumbent: float) -> None:
         """Convergence: what was gained decides whether the plan is worth another round; a draft is given up."""
@@ -427,7 +499,7 @@ class Portfolio:
             # The second round, too, often gains much.
             share = entry.plan.cost / entry.estimate
             self._share = min(self._share or share, share)
-        if entry.rounds == 0 and self.patience is _SAME_WAYS:
+        if entry.rounds == 0 and self.patience.same_ways:
             self._coarse = min(self._coarse or entry.plan.cost, entry.plan.cost)
         gained = entry.before - entry.plan.cost > WORTH_CHECKING * entry.plan.cost
         entry.fruitless = 0 if gained else entry.fruitless + 1
@@ -441,7 +513,7 @@ class Portfolio:
         out, self._settled = self._settled, []
         return out
 
-    def _offer(self, entry: _Entry, incumbent: float, work: Refiner | Optimiser) -> Plan | None:
+    def _offer(self, entry: _Entry, incumbent: float, work: Refiner | Optimiser | LocalSearch) -> Plan | None:
         """Have a plan checked that is clearly cheaper than the incumbent; where the judge objects, look closer."""
         if work.cost > incumbent * (1 - WORTH_CHECKING):
             return None
@@ -449,10 +521,10 @@ class Portfolio:
         report = self.incumbent.judge(plan)
         if report.ok:
             entry.plan, entry.draft = plan, False
-            if isinstance(work, Optimiser):
+            if not isinstance(work, Refiner):
                 work.confirm()
             return plan
-        if isinstance(work, Optimiser):
+        if not isinstance(work, Refiner):
             work.tighten(report)
         else:
             # Something slipped between the samples: go back to what was checked.
@@ -460,11 +532,16 @@ class Portfolio:
             entry.refiner = None
         return None
 
-    @staticmethod
-    def _due(entry: _Entry, incumbent: float) -> bool:
-        """Whether the judge is asked now: that takes longer than a program, and the next may gain as much again."""
-        entry.waiting = entry.waiting + 1 if entry.cost <= incumbent * (1 - WORTH_CHECKING) else 0
-        due = entry.waiting > _PATIENCE or entry.cost <= incumbent * (1 - _PLENTY)
+    def _due(self, entry: _Entry, incumbent: float) -> bool:
+        """Whether the judge is asked now: that takes longer than a program, and the next may gain as much again.
+
+        What has been gained when time is nearly up would be lost otherwise.
+        """
+        worth = entry.cost <= incumbent * (1 - WORTH_CHECKING)
+        entry.waiting = entry.waiting + 1 if worth else 0
+        patience = _LONGER if isinstance(entry.optimiser, LocalSearch) else _PATIENCE
+        last = worth and self.deadline.left_s < _LAST * self.incumbent.judging_s
+        due = last or entry.waiting > patience or entry.cost <= incumbent * (1 - _PLENTY)
         if due:
             entry.waiting = 0
         return due

@@ -59,6 +59,11 @@ _WINDOW = 8
 """Steps within which the best cost and the current merit have to fall by what is worth having."""
 
 
+def first_trust(nearness: Nearness) -> float:
+    """First radius (rad, or m where all joints slide) of the trust region of every joint."""
+    return _SLIDING if all(w.chain.prismatic.all() for w in nearness.worlds.values()) else TRUST
+
+
 class Optimiser:
     """Improves one plan: same order of events, same homotopy, but everything else may move.
 
@@ -72,6 +77,8 @@ class Optimiser:
     level : how often they are halved from the start.
     slide : whether transitions may slide along their strata; otherwise their configurations stay as they are.
     draft : whether robots may still collide with each other in what is given.
+    fixed_end : whether all robots end where they do, since it is a piece of a plan.
+    to_beat : cost below which it is worth to mend what grazes something.
 
     Attributes
     ----------
@@ -94,6 +101,8 @@ class Optimiser:
         level: int = 0,
         slide: bool = True,
         draft: bool = False,
+        fixed_end: bool = False,
+        to_beat: float = np.inf,
     ) -> None:
         self.problem = problem
         self.weights = problem.cost
@@ -103,8 +112,10 @@ class Optimiser:
         self.knot = knot
         self.levels = levels
         self.slide = slide
+        self.fixed_end = fixed_end
+        self.to_beat = to_beat
         self.steps = 0
-        self._first_trust = _SLIDING if all(w.chain.prismatic.all() for w in self.worlds.values()) else TRUST
+        self._first_trust = first_trust(nearness)
         self.trust = self._first_trust
         self.converged = False
         self._stalls = 0
@@ -142,6 +153,21 @@ class Optimiser:
         return min(self._best.cost, self._now.cost)
 
     @property
+    def knots(self) -> int:
+        """Number of knots that programs are about."""
+        return self._now.line.knots
+
+    @property
+    def current(self) -> float:
+        """Cost of the current iterate, which may still collide."""
+        return self._now.cost
+
+    @property
+    def deepest(self) -> float:
+        """Penetration (m), beyond what is tolerated, that the last program led to; 0 before the first."""
+        return self._depths[-1] if self._depths else 0.0
+
+    @property
     def transitions(self) -> list[Transition]:
         """Transitions of the best iterate."""
         return self._best.arrangement.transitions
@@ -156,8 +182,13 @@ class Optimiser:
         self._sure = self._best
 
     def tighten(self, report: Report) -> None:
-        """The judge refused the best iterate: ask for more clearance where it collided, and go on from there."""
+        """The judge refused the best iterate: ask for more clearance where it collided, and go on from there.
+
+        While a draft has none, it is what was given.
+        """
         refused = self._best
+        if np.isinf(refused.cost):
+            refused = self._iterate(refused.line, refused.q, refused.arrangement)
         self._best, self.converged, self._stalls = self._sure, False, 0
         self._trail.clear()
         self.trust = max(self.trust, 4 * _SMALLEST)
@@ -276,7 +307,7 @@ class Optimiser:
         return gain
 
     def _mended(self, x: Iterate, violations: Sequence[Violations]) -> Iterate | None:
-        return self.mending.attempt(x, violations, self._best.cost, self.collisions.level)
+        return self.mending.attempt(x, violations, min(self._best.cost, self.to_beat), self.collisions.level)
 
     def _looked_at(self, solved: Iterate) -> tuple[Iterate, CollisionRows, np.ndarray]:
         """What a program leads to, its knots spread evenly where steps have become too long; its collision rows, and
@@ -458,6 +489,6 @@ class Optimiser:
 
     def _adopt(self, x: Iterate) -> None:
         """Variables and closure rows for a new set of knots."""
-        self._pinned = pins(self.problem, x.line, x.arrangement.transitions, self.slide)
+        self._pinned = pins(self.problem, x.line, x.arrangement.transitions, self.slide, self.fixed_end)
         self._reduction: Reduction = reduce(x.line, self._pinned)
         self._closure = Closure(self.problem, self.worlds, x.line, x.q, self._pinned)

@@ -11,12 +11,17 @@ from mrtamp.plan import Transition
 from mrtamp.problem import AtConfiguration, Problem, RobotAt
 
 
-def pins(problem: Problem, line: Polyline, transitions: Sequence[Transition], slide: bool) -> dict[str, np.ndarray]:
-    """Robot -> knots (K,) at which its configuration stays; with `slide` only where no stratum offers freedom."""
+def pins(
+    problem: Problem, line: Polyline, transitions: Sequence[Transition], slide: bool, fixed_end: bool = False
+) -> dict[str, np.ndarray]:
+    """Robot -> knots (K,) at which its configuration stays; with `slide` only where no stratum offers freedom, with
+    `fixed_end` also where all is over.
+    """
     K = line.knots
     out = {r: np.zeros(K, dtype=bool) for r in line.columns}
     for pinned in out.values():
         pinned[0] = True
+        pinned[-1] |= fixed_end
     for condition in problem.goal:
         if isinstance(condition, RobotAt):
             out[condition.robot][-1] = True
