@@ -5,6 +5,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 BUDGET ?= 10
+# Processes that run tests.
+WORKERS ?= $(shell nproc 2>/dev/null || echo 1)
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test lint format notebooks venv clean
@@ -18,7 +20,7 @@ demo: $(VENV)/installed  ## plan `handover`, print the plan, write out/plan.json
 	@echo "Open out/plan.html in a browser, or run $(BIN)/mrtamp view out/plan.json"
 
 test: lint  ## lint, formatting, types, then all tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 lint: $(VENV)/installed-dev  ## ruff (lint and format) and mypy
 	$(BIN)/ruff check .
