@@ -207,7 +207,7 @@ def test_patience_follows_the_choice_there_is(tmp_path: Path) -> None:
 
 
 def test_what_has_converged_goes_on_beside_what_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many plans come, those that are refined further have their share of the turns, and they have theirs."""
+    """However many new plans come, what is refined further has its share of the turns, and new plans have theirs."""
     planner = planner_for(tmp_path)
     portfolio, best = planner.portfolio, roundabout(planner, 0.6)
     portfolio.add(best)

@@ -174,8 +174,7 @@ class Optimiser:
 
     def segments(self) -> list[Segment]:
         """Segments of the best iterate."""
-        parts = self._best.line.parts(self._best.q)
-        return [Segment(mode, q) for mode, q in zip(self._best.arrangement.modes, parts, strict=True)]
+        return self._best.line.segments(self._best.q, self._best.arrangement.modes)
 
     def confirm(self) -> None:
         """The judge accepted the best iterate: `tighten` will not go back behind it."""

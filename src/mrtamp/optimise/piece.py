@@ -22,7 +22,7 @@ class Whole:
 
     def segments(self) -> list[Segment]:
         """The plan's segments."""
-        return _segments(self.line, self.line.q, self.modes)
+        return self.line.segments(self.line.q, self.modes)
 
     def bounds(self) -> np.ndarray:
         """Knots (M,), ascending, at which it may be cut: no transition and no contact motion is there."""
@@ -73,7 +73,7 @@ class Piece:
         line = self.whole.line
         events = line.events[self.first : self.first + self.count] - self.low
         part = Polyline(line.columns, q[self.low : self.high + 1], events)
-        return _segments(part, part.q, self.whole.modes[self.first : self.first + self.count + 1])
+        return part.segments(part.q, self.whole.modes[self.first : self.first + self.count + 1])
 
     def replaced(self, segments: Sequence[Segment]) -> list[Segment]:
         """The plan's segments with others in place of its own; they begin and end at the same configurations."""
@@ -89,7 +89,3 @@ class Piece:
                 q[r] = np.concatenate([*head, q[r], *tail])
             out[k] = Segment(out[k].mode, q)
         return out
-
-
-def _segments(line: Polyline, q: np.ndarray, modes: Sequence[Mode]) -> list[Segment]:
-    return [Segment(mode, part) for mode, part in zip(modes, line.parts(q), strict=True)]

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from mrtamp.kinematics import Tool
+from mrtamp.modes import Mode
 from mrtamp.plan import Action, Segment, Transition
 
 REACH = 0.005
@@ -88,6 +89,10 @@ class Polyline:
         """Waypoints per segment and robot for knots q (K, N)."""
         bounds = [0, *self.events.tolist(), self.knots - 1]
         return [{r: q[a : b + 1, c].copy() for r, c in self.columns.items()} for a, b in pairwise(bounds)]
+
+    def segments(self, q: np.ndarray, modes: Sequence[Mode]) -> list[Segment]:
+        """Segments in the given modes for knots q (K, N)."""
+        return [Segment(mode, part) for mode, part in zip(modes, self.parts(q), strict=True)]
 
     def at(self, u: np.ndarray) -> Polyline:
         """The polyline with knots at parameters u (K',), ascending, which include all events and ends of stretches."""
