@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gantry import BAR, CUBE, Script, gantry_problem, grasp, put, valid_plan
-from pydrake.geometry import CollisionFilterDeclaration, GeometrySet
+from pydrake.geometry import Box, Capsule, CollisionFilterDeclaration, Cylinder, GeometrySet, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from mrtamp.check import Checker, check_plan
@@ -655,6 +655,63 @@ def test_displacements_never_exceed_their_bounds(pandas: tuple[Problem, JudgeSce
         bound = np.diff(travelled, axis=0) @ line.reach.T
         assert (moved <= bound + 1e-9).all()
         assert (bound.max(axis=1) <= np.diff(s) + 1e-9).all()
+
+
+def test_points_stay_as_near_to_their_chords_as_their_bends_say(
+    pandas: tuple[Problem, JudgeScene], problem: Problem
+) -> None:
+    """Long straight motions, of arms that turn and of a gantry that slides and turns."""
+    rng = np.random.default_rng(5)
+    tightest = 0.0
+    gantry = JudgeScene(problem)
+    slides = [rng.uniform(gantry.lower, gantry.upper, size=(2, len(gantry.lower))) for _ in range(2)]
+    for world, motion in (
+        *((pandas[1], _random_motion(*pandas, seed)) for seed in range(6)),
+        *((gantry, Motion(z, 0, {}, {}, set())) for z in slides),
+    ):
+        line = Timeline(world, motion)
+        s = np.linspace(*line.s[:2], 17)
+        share = (s - s[0]) / (s[-1] - s[0])
+        snapshot = Snapshot(line.envelopes, world.screws, line.configurations(s))
+        moved = line.travelled(s[[-1]]) - line.travelled(s[[0]])
+        bend = (world.screws.bends(moved) @ line.reach.T)[0] / 8
+        solids = np.arange(len(world.solids))
+        hull = np.array([snapshot.hull(solids, np.full(len(solids), n)) for n in range(len(s))])
+        chord = hull[-1] - hull[0]
+        longest = snapshot.chords(solids, (np.zeros_like(solids), np.full_like(solids, len(s) - 1)))
+        np.testing.assert_allclose(longest, np.linalg.norm(chord, axis=2).max(axis=1), atol=1e-12)
+        off = np.linalg.norm(hull - hull[0] - share[:, None, None, None] * chord, axis=3).max(axis=(0, 2))
+        assert (off <= bend + 1e-12).all()
+        tightest = max(tightest, float(np.max(off[bend > 0] / bend[bend > 0])))
+        i, j = rng.choice(len(solids), size=(2, 400))
+        normal = rng.normal(size=(400, 3))
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        certain = snapshot.parted(i, j, (np.zeros_like(i), np.full_like(i, len(s) - 1)), normal) - bend[i] - bend[j]
+        held = certain > 0
+        for n in range(len(s)):
+            here = snapshot.parted(i, j, (np.full_like(i, n), np.full_like(i, n)), normal)
+            assert (here >= certain - 1e-12)[held].all()
+    assert tightest > 0.3, "a bound that is never near the truth would be of no use"
+
+
+def test_planes_find_the_distances_that_drake_finds(pandas: tuple[Problem, JudgeScene]) -> None:
+    """Along the normal of the nearest points, boxes, balls, capsules and cylinders are as far apart as they are."""
+    problem, world = pandas
+    line = Timeline(world, _random_motion(problem, world, 1))
+    s = np.array([0.3 * line.length])
+    snapshot = Snapshot(line.envelopes, world.screws, line.configurations(s))
+    query = world.query(line.state(s)[0][0])
+    kinds = set()
+    for i, j in np.argwhere(line.eligible):
+        d, normal = world.nearest(query, i, j)
+        one = np.array([i]), np.array([j]), (np.zeros(1, dtype=int),) * 2
+        parted = snapshot.parted(*one, normal[None])[0]
+        assert parted <= d + 1e-4
+        shapes = [world.scene.scene_graph.model_inspector().GetShape(world.solids[k].id) for k in (i, j)]
+        if d > 1e-3 and all(isinstance(shape, Box | Sphere | Capsule | Cylinder) for shape in shapes):
+            kinds |= {type(shape) for shape in shapes}
+            assert parted >= d - 1e-4
+    assert {Box, Cylinder} <= kinds
 
 
 def test_segment_distances_agree_with_sampling() -> None:

@@ -3,6 +3,10 @@
 Every solid is enclosed in a sphere, a capsule and a box, all read from the judge's SceneGraph at the plant's default
 configuration; the joints move them by the product of exponentials.  A bound is never more than the true distance, so it
 can only ever clear a pair, not convict it.
+
+Between two samples every point of a solid stays near its chord, the straight line from where it was to where it will
+be: at most an eighth of its largest second derivative away (`Screws.bends` bounds that).  Chords say how far a solid
+has moved, and, where a plane separates two solids at both samples, how far it stays between them on the way.
 """
 
 from __future__ import annotations
@@ -12,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 Array = np.ndarray
+
+_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 
 
 @dataclass(eq=False)
@@ -30,6 +36,8 @@ class Envelopes:
     half: Array
     round: Array
     """Whether the capsule is exact (n,), so that the box adds nothing."""
+    disc: Array
+    """Whether it is a cylinder (n,) along the third axis of its box."""
     joint: Array
 
     def moved(self, solids: list[int], X: Array, joint: int) -> None:
@@ -50,6 +58,7 @@ class Envelopes:
             self.axes.copy(),
             self.half,
             self.round,
+            self.disc,
             self.joint.copy(),
         )
 
@@ -68,8 +77,16 @@ class Screws:
 
     def __init__(self, axis: Array, origin: Array, prismatic: Array, parent: list[int], at: Array) -> None:
         self.axis, self.origin, self.prismatic, self.parent, self.at = axis, origin, prismatic, parent, at
-        depth = [len(self._above(j)) for j in range(len(parent))]
-        self._order = sorted(range(len(parent)), key=lambda j: depth[j])
+        above = [self._above(j) for j in range(len(parent))]
+        depth = np.array([len(upstream) for upstream in above], dtype=int)
+        self._ranks = [np.flatnonzero(depth == d) for d in range(int(depth.max(initial=-1)) + 1)]
+        """Joints that hang on joints of the rank before."""
+        a, zero = axis.T, np.zeros(len(parent))
+        K = np.array([[zero, -a[2], a[1]], [a[2], zero, -a[0]], [-a[1], a[0], zero]])
+        self._K = np.moveaxis(K, 2, 0)[:, None]
+        self._turns_before = np.zeros((len(parent), len(parent)))
+        for j, upstream in enumerate(above):
+            self._turns_before[j, [k for k in upstream if not prismatic[k]]] = 1.0
 
     def _above(self, j: int) -> list[int]:
         return [] if self.parent[j] < 0 else [self.parent[j], *self._above(self.parent[j])]
@@ -83,18 +100,27 @@ class Screws:
         R = np.empty((N + 1, S, 3, 3))
         p = np.zeros((N + 1, S, 3))
         R[N] = np.eye(3)
-        for j in self._order:
-            angle = z[:, j] - self.at[j]
-            a, k = self.axis[j], self.parent[j]
-            if self.prismatic[j]:
-                R[j] = R[k]
-                p[j] = p[k] + R[k] @ a * angle[:, None]
-                continue
-            K = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-            turn = np.eye(3) + np.sin(angle)[:, None, None] * K + (1 - np.cos(angle))[:, None, None] * (K @ K)
-            R[j] = R[k] @ turn
-            p[j] = p[k] + np.einsum("sab,sb->sa", R[k], self.origin[j] - turn @ self.origin[j])
+        for joints in self._ranks:
+            before = np.array(self.parent)[joints]
+            moved = (z[:, joints] - self.at[joints]).T[..., None]  # (J, S, 1)
+            slides = self.prismatic[joints][:, None, None]
+            angle, way = np.where(slides, 0.0, moved), np.where(slides, moved, 0.0)
+            K, origin = self._K[joints], self.origin[joints][:, None]
+            turn = np.eye(3) + np.sin(angle)[..., None] * K + (1 - np.cos(angle))[..., None] * (K @ K)
+            R[joints] = R[before] @ turn
+            shift = origin - (turn @ origin[..., None])[..., 0] + way * self.axis[joints][:, None]
+            p[joints] = p[before] + (R[before] @ shift[..., None])[..., 0]
         return R, p
+
+    def bends(self, moved: Array) -> Array:
+        """Second derivatives of straight joint motions of |dq| = `moved` (E, N), per metre of reach: (E, N).
+
+        A point that joint k can have `reach[k]` (m) from its axis has, in time that runs from 0 to 1, a second
+        derivative of at most bends @ reach: |d2p / dq_j dq_k| is no more than the reach of the joint further down, and
+        nothing where the one further up is prismatic.
+        """
+        turns = np.where(self.prismatic, 0.0, moved)
+        return np.asarray(moved * (turns + 2.0 * moved @ self._turns_before.T))
 
 
 class Snapshot:
@@ -105,6 +131,49 @@ class Snapshot:
         self._R, self._p = screws.transforms(z)
         R, p = self._R[envelopes.joint], self._p[envelopes.joint]
         self.centre = np.einsum("nsab,nb->nsa", R, envelopes.centre) + p  # (n, S, 3)
+        corners = envelopes.centre[:, None] + (_SIGNS * envelopes.half[:, None]) @ envelopes.axes.swapaxes(1, 2)
+        self._hull = np.where(envelopes.round[:, None, None], np.tile(envelopes.ends, (1, 4, 1)), corners)
+
+    def extended(self, other: Snapshot) -> Snapshot:
+        """The samples of this one and then those of another one of the same envelopes."""
+        out = object.__new__(Snapshot)
+        out.envelopes, out._hull = self.envelopes, self._hull
+        out._R, out._p = np.concatenate([self._R, other._R], axis=1), np.concatenate([self._p, other._p], axis=1)
+        out.centre = np.concatenate([self.centre, other.centre], axis=1)
+        return out
+
+    def hull(self, solids: Array, s: Array) -> Array:
+        """Points (E, 8, 3) at the samples s (E,) in whose hull `solids` (E,) are, but for the radius if round."""
+        k = self.envelopes.joint[solids]
+        return np.asarray(self._hull[solids] @ self._R[k, s].swapaxes(1, 2) + self._p[k, s][:, None])
+
+    def chords(self, solids: Array, s: tuple[Array, Array]) -> Array:
+        """The longest chord (E,) of any point of the hulls of `solids` (E,) from one sample to the other.
+
+        What is round counts by the ends of its axis: it is the same ball around them however it turns.
+        """
+        way = self.hull(solids, s[1]) - self.hull(solids, s[0])
+        return np.asarray(np.sqrt(np.einsum("eab,eab->ea", way, way).max(axis=1)))
+
+    def parted(self, i: Array, j: Array, s: tuple[Array, Array], normal: Array) -> Array:
+        """How far apart (E,) planes with the `normal` (E, 3) keep solids i and j, at both samples, each on one side."""
+        side = np.zeros(len(i))
+        out = np.full(len(i), np.inf)
+        for at in s:
+            between = np.einsum("ea,ea->e", normal, self.centre[i, at] - self.centre[j, at])
+            side = np.where(side == 0.0, np.sign(between), side)
+            out = np.minimum(out, side * between - self._extent(i, at, normal) - self._extent(j, at, normal))
+        return out
+
+    def _extent(self, i: Array, s: Array, normal: Array) -> Array:
+        """How far (E,) solids reach from their centres along unit vectors (E, 3)."""
+        e = self.envelopes
+        local = np.einsum("eba,eb->ea", self._R[e.joint[i], s], normal)
+        m, half = np.abs(np.einsum("eba,eb->ea", e.axes[i], local)), e.half[i]
+        box = np.einsum("ea,ea->e", m, half)
+        disc = half[:, 0] * np.hypot(m[:, 0], m[:, 1]) + half[:, 2] * m[:, 2]
+        axis = np.einsum("ea,ea->e", e.ends[i, 1] - e.ends[i, 0], local)
+        return np.where(e.round[i], np.abs(axis) / 2 + e.radius[i], np.where(e.disc[i], disc, box))
 
     def spheres(self, i: Array, j: Array) -> Array:
         """Bounds (P, S) for pairs of solids i, j (P,) at all samples."""

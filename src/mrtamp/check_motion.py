@@ -2,8 +2,8 @@
 
 A segment is parametrised by s, the largest displacement that any robot point can have made.  Distances are asked for at
 samples of s; between two samples at which a pair of solids is d0 and d1 apart, it cannot have met if d0 + d1 exceeds
-the bound on its relative displacement.  Pairs that this does not settle are bisected, down to samples at most
-`resolution` of relative displacement apart.
+the bound on its relative displacement, nor if one plane separates it all the way (`check_stretches`).  Pairs that this
+does not settle are bisected, down to samples at most `resolution` of relative displacement apart.
 
 Contact is allowed in four cases only.  What a robot holds may touch its gripper; an object at rest may touch what it
 rests on; an object that was just picked may touch what it stood on until they are TOUCH apart for the first time; and
@@ -17,20 +17,19 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from mrtamp.check_bounds import Snapshot
 from mrtamp.check_contact import TOUCH
 from mrtamp.check_report import Report, Side, Violation
 from mrtamp.check_scene import JudgeScene, box_gap
+from mrtamp.check_stretches import NOISE, Pairs, Samples, Stretches
 from mrtamp.kinematics import inverse
 
 STRIDE = 0.1
 """Displacement (m) of any robot point between the samples from which bisection starts: the pace in free space."""
-NOISE = 1e-4
-"""Margin (m) on certificates for the accuracy of Drake's distances (2e-5)."""
 
 
 @dataclass(eq=False)
@@ -128,29 +127,6 @@ class Timeline:
         return np.where(common, 0.0, self.reach[i] + self.reach[j])
 
 
-@dataclass(eq=False)
-class _Pairs:
-    """Pairs of solids (P, 2), their displacement rates (P, N), and the window (P, 2) of s in which each is judged."""
-
-    solids: np.ndarray
-    rates: np.ndarray
-    window: np.ndarray
-    resolution: float
-
-    def inside(self, s: np.ndarray, pair: Any) -> np.ndarray:
-        """Whether s lies in the windows of `pair`."""
-        return (s >= self.window[pair, 0]) & (s <= self.window[pair, 1])
-
-    def unsettled(self, d: tuple[Any, Any], moved: Any, s: tuple[Any, Any], pair: Any) -> np.ndarray:
-        """Whether `pair`, at least d apart at the two s, may meet in between and is sampled too coarsely there."""
-        open_ = (d[0] + d[1] <= moved + NOISE) & (moved > self.resolution)
-        return open_ & (s[0] < self.window[pair, 1]) & (s[1] > self.window[pair, 0])
-
-    def stretches(self, d: np.ndarray, moved: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """`unsettled` for all stretches between samples s (S,) and all pairs (S - 1, P), at least d (S, P) apart."""
-        return self.unsettled((d[:-1], d[1:]), moved, (s[:-1, None], s[1:, None]), slice(None))
-
-
 class _Hits:
     """Samples in collision: for every pair of bodies and step of the plan, the deepest."""
 
@@ -190,7 +166,8 @@ class MotionJudge:
         """
         s = line.samples(STRIDE)
         report.samples += len(s)
-        snapshot = Snapshot(line.envelopes, self.world.screws, line.configurations(s))
+        samples = Samples(self.world, line, s)
+        snapshot = samples.snapshot
         # No solid moves further than STRIDE between samples, so two that are further apart at both are settled.
         i, j = snapshot.near(line.eligible, STRIDE)
         if not len(i):
@@ -199,18 +176,27 @@ class MotionJudge:
         for (name, other), interval in exempt.items():
             mine, theirs = self.world.of.get(name, []), self.world.of.get(other, [])
             window[(np.isin(i, mine) & np.isin(j, theirs)) | (np.isin(i, theirs) & np.isin(j, mine))] = interval
-        pairs = _Pairs(np.column_stack([i, j]), line.rates(i, j), window, self.resolution)
+        pairs = Pairs(np.column_stack([i, j]), line.rates(i, j), window, self.resolution)
         d = snapshot.spheres(i, j).T
         moved = np.diff(line.travelled(s), axis=0) @ pairs.rates.T
         d[1:, moved.sum(axis=0) == 0.0] = np.inf  # what does not move is looked at once
         at, pair = self._open(pairs, s, d, moved)
         d[at, pair] = np.maximum(d[at, pair], snapshot.shapes(at, i[pair], j[pair]))
         at, pair = self._open(pairs, s, d, moved)
-        d[at, pair] = self._distances(line, s, at, pairs.solids[pair], report)
-        report.clearance(d[at, pair][pairs.inside(s[at], pair)])
-        self._sift(line, s, pairs, d, report, exempt).report(report)
+        hits = _Hits(self.world, line)
+        d[at, pair], normal, collides = self._looked_at(samples, pairs, at, pair, exempt, hits, report)
+        row = np.full(d.shape, -1)
+        row[at, pair] = np.arange(len(at))
+        hit = np.zeros(d.shape, dtype=bool)
+        hit[at, pair] = collides
+        start, pair = np.nonzero(pairs.stretches(d, moved, s) & ~hit[:-1] & ~hit[1:])
+        ends = np.stack([start, start + 1], axis=1)
+        normals = np.concatenate([normal, np.full((1, 3), np.nan)])[row[ends, pair[:, None]]]
+        stretches = Stretches(start, start + 1, pair, d[ends, pair[:, None]], normals)
+        self._bisect(samples, pairs, stretches, report, exempt, hits)
+        hits.report(report)
 
-    def _open(self, pairs: _Pairs, s: np.ndarray, d: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _open(self, pairs: Pairs, s: np.ndarray, d: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Samples and pairs whose bounds d (S, P) decide nothing: about the sample, or about a neighbouring stretch."""
         unsettled = pairs.stretches(d, moved, s)
         need = (d <= NOISE) & pairs.inside(s[:, None], slice(None))
@@ -219,86 +205,73 @@ class MotionJudge:
         at, pair = np.nonzero(need)
         return at, pair
 
-    def _distances(
-        self, line: Timeline, s: np.ndarray, at: np.ndarray, solids: np.ndarray, report: Report
-    ) -> np.ndarray:
-        """Drake's distances (E,) of pairs of solids (E, 2) at the samples s[at]; `at` (E,) in ascending order."""
-        out = np.empty(len(at))
-        samples, row = np.unique(at, return_inverse=True)
-        q, _ = line.state(s[samples]) if len(samples) else (np.empty((0, 0)), {})
-        current, query = -1, None
-        for e, (i, j) in enumerate(solids):
-            if row[e] != current:
-                current = row[e]
-                query = self.world.query(q[current])
-            out[e] = self.world.distance(query, i, j)
-        return out
-
-    def _sift(
+    def _looked_at(
         self,
-        line: Timeline,
-        s: np.ndarray,
-        pairs: _Pairs,
-        d: np.ndarray,
+        samples: Samples,
+        pairs: Pairs,
+        at: np.ndarray,
+        pair: np.ndarray,
+        exempt: Mapping[tuple[str, str], tuple[float, float]],
+        hits: _Hits,
+        report: Report,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Drake's distances (E,) of pairs at samples (E,) in ascending order, their directions (E, 3), and which of
+        them are collisions (E,): they are noted."""
+        d, normal, collides = np.empty(len(at)), np.empty((len(at), 3)), np.zeros(len(at), dtype=bool)
+        solids, inside = pairs.solids[pair].tolist(), pairs.inside(samples.s[at], pair)
+        used, first = np.unique(at, return_index=True)
+        q, _ = samples.line.state(samples.s[used])
+        for k, (low, high) in enumerate(pairwise([*first.tolist(), len(at)])):
+            query = self.world.query(q[k])
+            for e in range(low, high):
+                d[e], normal[e] = self.world.nearest(query, *solids[e])
+            hit = inside[low:high] & (d[low:high] <= 0.0)
+            s = float(samples.s[used[k]])
+            if hit.any() and not self._tolerated(samples.line, query, s, exempt):
+                collides[low:high] = hit
+                for e in low + np.flatnonzero(hit):
+                    hits.note(pairs.solids[pair[e]], s, float(d[e]))
+        report.clearance(d[inside])
+        return d, normal, collides
+
+    def _bisect(
+        self,
+        samples: Samples,
+        pairs: Pairs,
+        stretches: Stretches,
         report: Report,
         exempt: Mapping[tuple[str, str], tuple[float, float]],
-    ) -> _Hits:
-        """Note the samples in collision, and bisect the stretches that their ends do not certify."""
-        hits = _Hits(self.world, line)
-        hit = pairs.inside(s[:, None], slice(None)) & (d <= 0.0)
-        touched = np.flatnonzero(hit.any(axis=1))
-        hit[touched[self._tolerated(line, s[touched], exempt)]] = False
-        for n, c in zip(*np.nonzero(hit), strict=True):
-            hits.note(pairs.solids[c], float(s[n]), float(d[n, c]))
-        if hits and report.first_only:
-            return hits
-        moved = np.diff(line.travelled(s), axis=0) @ pairs.rates.T
-        unsettled = pairs.stretches(d, moved, s)
-        unsettled &= ~hit[:-1] & ~hit[1:]
-        stretch, pair = np.nonzero(unsettled)
-        lo, hi, d0, d1 = s[stretch], s[stretch + 1], d[stretch, pair], d[stretch + 1, pair]
-        while len(pair) and not (hits and report.first_only):
-            # One row per stretch and pair; rows of one stretch share one sample.
-            order = np.argsort(lo, kind="stable")
-            lo, hi, d0, d1, pair = lo[order], hi[order], d0[order], d1[order], pair[order]
-            middle = (lo + hi) / 2
-            samples, at = np.unique(middle, return_inverse=True)
-            dm = self._distances(line, samples, at, pairs.solids[pair], report)
-            report.samples += len(samples)
-            inside = pairs.inside(middle, pair)
-            report.clearance(dm[inside])
-            hit = inside & (dm <= 0.0)
-            touched = np.unique(at[hit])
-            hit &= ~np.isin(at, touched[self._tolerated(line, samples[touched], exempt)])
-            for row in np.flatnonzero(hit):
-                hits.note(pairs.solids[pair[row]], float(middle[row]), float(dm[row]))
+        hits: _Hits,
+    ) -> None:
+        """Halve the stretches that their ends do not certify until nothing is left open; note what collides."""
+        stretches = stretches.unsettled(samples, pairs)
+        while len(stretches) and not (hits and report.first_only):
+            # Stretches of several pairs share one sample in the middle.
+            middle = (samples.s[stretches.start] + samples.s[stretches.end]) / 2
+            order = np.argsort(middle, kind="stable")
+            stretches, middle = stretches.where(order), middle[order]
+            s, at = np.unique(middle, return_inverse=True)
+            at += len(samples.s)
+            samples.add(s)
+            report.samples += len(s)
+            d, normal, hit = self._looked_at(samples, pairs, at, stretches.pair, exempt, hits, report)
             # A pair that collides is not searched any further here: its stretch is known to be bad.
             free = ~hit
-            lo, hi = np.concatenate([lo[free], middle[free]]), np.concatenate([middle[free], hi[free]])
-            d0, d1 = np.concatenate([d0[free], dm[free]]), np.concatenate([dm[free], d1[free]])
-            pair = np.concatenate([pair[free], pair[free]])
-            travel = np.einsum("rn,rn->r", line.travelled(hi) - line.travelled(lo), pairs.rates[pair])
-            keep = pairs.unsettled((d0, d1), travel, (lo, hi), pair)
-            lo, hi, d0, d1, pair = lo[keep], hi[keep], d0[keep], d1[keep], pair[keep]
-        return hits
+            stretches = stretches.where(free).halves(at[free], d[free], normal[free]).unsettled(samples, pairs)
 
     def _tolerated(
-        self, line: Timeline, s: np.ndarray, exempt: Mapping[tuple[str, str], tuple[float, float]]
-    ) -> np.ndarray:
-        """At which s (S,) all penetrations of the configuration add up to no more than the problem tolerates."""
-        out = np.zeros(len(s), dtype=bool)
-        if self.tolerance <= 0.0 or not len(s):
-            return out
-        q, _ = line.state(s)
-        for k, at in enumerate(s):
-            total = 0.0
-            for pair, depth in self.world.penetrations(self.world.query(q[k])).items():
-                one, two = (self.world.solids[i].side.owner for i in pair)
-                low, high = exempt.get((one, two)) or exempt.get((two, one)) or (0.0, line.length)
-                if pair not in line.motion.allowed and low <= at <= high:
-                    total += depth
-            out[k] = total <= self.tolerance
-        return out
+        self, line: Timeline, query: Any, s: float, exempt: Mapping[tuple[str, str], tuple[float, float]]
+    ) -> bool:
+        """Whether all penetrations at s, where Drake answers `query`, add up to no more than the problem tolerates."""
+        if self.tolerance <= 0.0:
+            return False
+        total = 0.0
+        for pair, depth in self.world.penetrations(query).items():
+            one, two = (self.world.solids[i].side.owner for i in pair)
+            low, high = exempt.get((one, two)) or exempt.get((two, one)) or (0.0, line.length)
+            if pair not in line.motion.allowed and low <= s <= high:
+                total += depth
+        return total <= self.tolerance
 
     def resting(
         self, motion: Motion, names: list[str], report: Report, standing: Collection[tuple[str, str]] = ()

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import Capsule, GeometryId, HalfSpace, Sphere
+from pydrake.geometry import Capsule, Cylinder, GeometryId, HalfSpace, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import RigidBody
 
@@ -24,6 +24,7 @@ from mrtamp.scene import Scene, build_scene, robot_bodies, robot_body, robot_joi
 UNBOUNDED_SLIDE = 10.0
 """A prismatic joint without limits is judged within this many metres of zero."""
 
+_UNKNOWN = np.full(3, np.nan)
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 
 
@@ -46,6 +47,8 @@ class Solid:
     """Radius (m) of a sphere about the centre of the box that encloses the geometry."""
     round: bool
     """Whether it is a sphere or a capsule: the hull of its spheres itself."""
+    disc: bool
+    """Whether it is a cylinder."""
 
 
 class JudgeScene:
@@ -240,9 +243,10 @@ class JudgeScene:
             X_FG4 = X_FG.GetAsMatrix4()
             centres = points @ X_FG4[:3, :3].T + X_FG4[:3, 3]
             bound = float(np.max(np.linalg.norm(centres - X_FC.translation(), axis=1) + radii))
-            round_ = isinstance(shape, Sphere | Capsule)
+            round_, disc = isinstance(shape, Sphere | Capsule), isinstance(shape, Cylinder)
             joint = self._carrier(body) if side.kind == "robot" else -1
-            self.solids.append(Solid(g, side, frame, joint, X_FC.GetAsMatrix4(), half, centres, radii, bound, round_))
+            X = X_FC.GetAsMatrix4()
+            self.solids.append(Solid(g, side, frame, joint, X, half, centres, radii, bound, round_, disc))
 
     def _envelopes(self) -> None:
         """Enclosing shapes of all solids, objects still in their own frames, and the pairs that may not touch."""
@@ -259,6 +263,7 @@ class JudgeScene:
             axes=np.array([X[:3, :3] for X in X_WC]),
             half=np.array([s.half for s in self.solids]),
             round=np.array([s.round for s in self.solids]),
+            disc=np.array([s.disc for s in self.solids]),
             joint=np.array([s.joint for s in self.solids]),
         )
         inspector = self.scene.scene_graph.model_inspector()
@@ -298,16 +303,21 @@ class JudgeScene:
         return {(i, j): max(-self.distance(query, i, j), 0.0) for i, j in pairs if self.may_collide(i, j)}
 
     def distance(self, query, i: int, j: int) -> float:
-        """Signed distance (m) of two solids; collision filters do not apply.
+        """Signed distance (m) of two solids; collision filters do not apply."""
+        return self.nearest(query, i, j)[0]
+
+    def nearest(self, query, i: int, j: int) -> tuple[float, np.ndarray]:
+        """Signed distance (m) of two solids, and the direction (3,) along which they are that far apart, if known.
 
         Where Drake's search does not converge, which it may not for faces that touch, it is no more than that.
         """
         a, b = self.solids[i].id, self.solids[j].id
         try:
-            return query.ComputeSignedDistancePairClosestPoints(a, b).distance
+            found = query.ComputeSignedDistancePairClosestPoints(a, b)
+            return found.distance, found.nhat_BA_W
         except RuntimeError:
             depths = [p.depth for p in query.ComputePointPairPenetration() if {p.id_A, p.id_B} == {a, b}]
-            return -max(depths, default=0.0)
+            return -max(depths, default=0.0), _UNKNOWN
 
 
 def pose_coordinates(X: np.ndarray) -> np.ndarray:
