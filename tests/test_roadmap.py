@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -85,6 +86,30 @@ def test_lazy_validation_finds_the_shortest_valid_path(roadmap: Roadmap, share: 
             assert length(roadmap, path) == pytest.approx(nx.dijkstra_path_length(truth, 0, goal))
     assert np.all(invalid[blocked]), "only what failed is blocked"
     assert len(set(asked)) < 0.7 * roadmap.n_edges, "lazily"
+
+
+def test_what_is_seen_at_a_glance_is_not_validated(roadmap: Roadmap) -> None:
+    rng = np.random.default_rng(4)
+    bad = rng.random(roadmap.n_vertices) < 0.2
+    bad[[0, 5, 50, 100]] = False
+    invalid = bad[roadmap.ends].any(axis=1) | (rng.random(roadmap.n_edges) < 0.1)
+    asked: list[int] = []
+
+    def glance(edges: Sequence[int]) -> list[int]:
+        vertices = [v for v in roadmap.ends[list(edges)].ravel().tolist() if bad[v]]
+        return roadmap.arcs(vertices[0])[1].tolist() if vertices else []
+
+    def validate(e: int) -> bool:
+        asked.append(e)
+        return not invalid[e]
+
+    for goal in (5, 50, 100):
+        path = lazy_path(roadmap, 0, goal, np.zeros(roadmap.n_edges, dtype=bool), validate, 10_000, glance)
+        without = lazy_path(roadmap, 0, goal, np.zeros(roadmap.n_edges, dtype=bool), lambda e: not invalid[e], 10_000)
+        assert (path is None) == (without is None)
+        if path is not None and without is not None:
+            assert length(roadmap, path) == pytest.approx(length(roadmap, without))
+    assert not bad[roadmap.ends[asked]].any()
 
 
 def test_lazy_validation_gives_up_after_the_rounds_it_was_given(roadmap: Roadmap) -> None:
@@ -247,7 +272,7 @@ def test_unconnected_vertices_are_reached_through_their_exits_only(roadmap: Road
     roadmap.offer_direct(0, v)
     blocked = np.zeros(roadmap.n_edges, dtype=bool)
     assert roadmap.shortest(0, v, blocked) == [0, exit_, v], "the direct edge to the exit is offered"
-    assert roadmap.neighbours(v) == [exit_]
+    assert list(roadmap.neighbours(v)) == [exit_]
 
 
 @pytest.mark.parametrize("size", [0.04, 0.6], ids=["small", "large"])

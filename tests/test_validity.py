@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -151,6 +152,31 @@ def test_a_robot_alone_is_free_exactly_where_the_full_plant_says_so(
             assert planner.validity.edge(robot, e, mode) is free, "the cache answers the same"
             verdicts.append(free)
     assert 5 < sum(verdicts) < 45, "the edges should be a mixture"
+
+
+@pytest.mark.parametrize("k", [0, 1, 2])
+def test_what_is_blocked_at_a_glance_is_blocked_in_the_full_plant(
+    planner: Planner, full: FullPlant, modes: list[Mode], k: int
+) -> None:
+    """At the vertex, if all its edges are; and every edge that is seen is known to be blocked from then on."""
+    mode, seen, refused = modes[k], 0, 0
+    for robot in ("left", "right"):
+        roadmap = planner.roadmaps[robot]
+        pairs = edges(planner, robot, 30, seed=60 + k)
+        numbers = [roadmap.edge(a, b) for a, b in pairs]
+        for (a, _), (_, c) in pairwise(pairs):
+            roadmap.edge(a, c)  # edges beside those that are looked at
+        while found := planner.validity.glance(robot, numbers, mode):
+            seen += len(found)
+            for e in found:
+                q = roadmap.path_samples(e, 5)
+                assert max(full.depth(mode, {**home(planner), robot: x}, "robot") for x in q) > 0.0
+                assert not planner.validity.edge(robot, e, mode)
+            numbers = [e for e in numbers if e not in found]
+        left = [planner.validity.edge(robot, e, mode) for e in numbers]
+        refused += left.count(False)
+    assert seen > 15
+    assert refused < 0.2 * seen, "few collisions are so short that glances miss them"
 
 
 def test_fresh_verdicts_are_those_of_the_cache_whatever_was_asked_before(planner: Planner, modes: list[Mode]) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from pydrake.geometry import (
@@ -66,17 +67,18 @@ def slot_keys(problem: Problem) -> dict[str, str]:
     return out
 
 
+@lru_cache(maxsize=1024)
 def bisection_order(n: int) -> np.ndarray:
     """The indices 0..n-1, ends first, then midpoints of the widest gaps: an invalid edge is found out early."""
-    if n <= 2:
-        return np.arange(n)
-    order, gaps = [0, n - 1], [(0, n - 1)]
+    order, gaps = list(range(min(n, 1))) + list(range(max(n - 1, 1), n)), [(0, n - 1)]
     for low, high in gaps:
         middle = (low + high) // 2
         if middle not in (low, high):
             order.append(middle)
             gaps += [(low, middle), (middle, high)]
-    return np.array(order)
+    out = np.array(order, dtype=int)
+    out.flags.writeable = False
+    return out
 
 
 def _slots(problem: Problem, prefix: str) -> tuple[dict[str, MovableObject], dict[str, str]]:
@@ -131,6 +133,10 @@ class Bounds:
     def spheres(self, q: np.ndarray) -> np.ndarray:
         """World centres (N, B, 3) at configurations q (N, n)."""
         R, p = self.chain.poses(q, self.bodies)
+        return self.moved(R, p)
+
+    def moved(self, R: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """World centres (N, B, 3) where the bodies are at R (B, N, 3, 3), p (B, N, 3)."""
         return np.swapaxes(p + np.einsum("bnij,bj->bni", R, self.centres), 0, 1)
 
 
@@ -188,6 +194,13 @@ class RobotWorld:
             rows[:, self.in_scene.fingers] = self.in_scene.finger_positions(held.width)
             write_held(self.scene, rows, self.slot_of[held.object], self.tool, q, held)
         return rows
+
+    def spheres_and_grasp(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Centres (N, B, 3) of the bodies' spheres, and R_WG (N, 3, 3), p_WG (N, 3), at configurations q (N, n)."""
+        Rs, ps, _ = self.chain.sweep(q)
+        rows = [self.chain.index[b] for b in self.bounds.bodies]
+        centres = self.bounds.moved(np.stack([Rs[i] for i in rows]), np.stack([ps[i] for i in rows]))
+        return centres, *self.tool.carried(Rs, ps)
 
     def _seven(self, X: np.ndarray) -> np.ndarray:
         known = self._pose7.get(id(X))

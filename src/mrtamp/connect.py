@@ -7,7 +7,7 @@ other robots aside (Kuffner and LaValle, 2000).  What they find are vertices lik
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -183,9 +183,10 @@ class Connector:
         validate: Callable[[int], bool],
         rounds: int,
         join: Callable[[], list[int] | None],
+        glance: Callable[[Sequence[int]], Sequence[int]] | None = None,
     ) -> list[int] | None:
         """`lazy_path`; where that finds nothing, what trees found before, or else what `join` finds."""
-        path = lazy_path(roadmap, start, goal, blocked, validate, rounds)
+        path = lazy_path(roadmap, start, goal, blocked, validate, rounds, glance)
         if path is not None:
             return path
         for other in (lambda: self._known(roadmap, start, goal), join):

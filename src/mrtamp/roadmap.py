@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -51,12 +52,15 @@ class Roadmap:
         self.name = world.name
         self.n_dof = world.chain.n
         self._q = np.empty((64, self.n_dof))
-        self._ends = np.empty((256, 2), dtype=np.int64)
+        self._ends = np.empty((256, 2), dtype=np.int32)
         self._w = np.empty(256)
         self.n_vertices = 0
         self.n_edges = 0
-        self._edge_of: dict[tuple[int, int], int] = {}
-        self._adjacent: list[list[int]] = []
+        # Of every vertex: the vertices that share an edge with it, and the numbers of these edges.  There are millions.
+        self._adjacent: list[array[int]] = []
+        self._incident: list[array[int]] = []
+        self._standing: dict[int, int] = {}
+        """Vertex -> its edge to itself."""
         self._arcs = _Arcs()
         self.contact: dict[int, tuple[str, str]] = {}
         self.exits: dict[int, list[int]] = {}
@@ -92,7 +96,8 @@ class Roadmap:
         i = self.n_vertices
         self._q[i] = q
         self.n_vertices += 1
-        self._adjacent.append([])
+        self._adjacent.append(array("i"))
+        self._incident.append(array("i"))
         if connect:
             self._connect(i)
             self._open_up(i)
@@ -135,9 +140,20 @@ class Roadmap:
 
     def edge(self, a: int, b: int) -> int:
         """The edge between two vertices, made if need be; (a, a) is the degenerate edge of standing at a."""
-        key = (a, b) if a <= b else (b, a)
-        known = self._edge_of.get(key)
-        return self._add_edge(*key, float(np.linalg.norm(self._q[a] - self._q[b]))) if known is None else known
+        known = self._find_edge(a, b)
+        if known is not None:
+            return known
+        return self._add_edge(min(a, b), max(a, b), float(np.linalg.norm(self._q[a] - self._q[b])))
+
+    def _find_edge(self, a: int, b: int) -> int | None:
+        if a == b:
+            return self._standing.get(a)
+        if len(self._adjacent[b]) < len(self._adjacent[a]):
+            a, b = b, a
+        try:
+            return self._incident[a][self._adjacent[a].index(b)]
+        except ValueError:
+            return None
 
     def _add_edge(self, a: int, b: int, length: float) -> int:
         """A new edge, a <= b."""
@@ -146,19 +162,21 @@ class Roadmap:
             self._w = np.concatenate([self._w, np.empty_like(self._w)])
         e = self.n_edges
         self._ends[e, 0], self._ends[e, 1], self._w[e] = a, b, length
-        self._edge_of[a, b] = e
         self.n_edges += 1
-        if a != b:
-            self._adjacent[a].append(b)
-            self._adjacent[b].append(a)
-            self._arcs.add(a, b, e)
-            if self.inserted is not None:
-                self.inserted(self.name, e)
+        if a == b:
+            self._standing[a] = e
+            return e
+        for v, w in ((a, b), (b, a)):
+            self._adjacent[v].append(w)
+            self._incident[v].append(e)
+        self._arcs.add(a, b, e)
+        if self.inserted is not None:
+            self.inserted(self.name, e)
         return e
 
     def length(self, a: int, b: int) -> float:
         """Length (rad) of the straight motion between two vertices."""
-        e = self._edge_of.get((a, b) if a <= b else (b, a))
+        e = self._find_edge(a, b)
         return float(self._w[e]) if e is not None else float(np.linalg.norm(self._q[b] - self._q[a]))
 
     def n_samples(self, e: int) -> int:
@@ -248,7 +266,7 @@ class _Arcs:
         self._start = np.zeros(1, dtype=np.int32)
         self._used = np.zeros(0, dtype=np.int64)
         self._target = np.zeros(0, dtype=np.int32)
-        self._edge = np.zeros(0, dtype=np.int64)
+        self._edge = np.zeros(0, dtype=np.int32)
         self._stale = True
 
     def add(self, a: int, b: int, e: int) -> None:
@@ -296,7 +314,7 @@ class _Arcs:
         room = self._used + self._used // 4 + 8
         self._start = np.concatenate([[0], np.cumsum(room)]).astype(np.int32)
         self._target = np.repeat(np.arange(rows, dtype=np.int32), room)
-        self._edge = np.full(len(self._target), -1)
+        self._edge = np.full(len(self._target), -1, dtype=np.int32)
         first = np.cumsum(self._used) - self._used
         place = np.repeat(self._start[:-1] - first, self._used) + np.arange(len(order))
         self._target[place], self._edge[place] = target[order], edge[order]
@@ -381,9 +399,7 @@ def prm_star_neighbours(n: int, dof: int) -> int:
 
 def samples_between(world: RobotWorld, points: np.ndarray, a: np.ndarray, b: np.ndarray) -> int:
     """Number of samples of the straight motion a -> b that keeps every tracked point's steps within RESOLUTION."""
-    q = np.linspace(a, b, _COARSE)
-    tracked = world.bounds.spheres(q)
-    R, p = world.tool.pose(q)
+    tracked, R, p = world.spheres_and_grasp(np.linspace(a, b, _COARSE))
     hand = p[:, None] + np.einsum("nij,kj->nki", R, points)
     # The fastest coarse part decides: points do not move evenly.
     parts = np.concatenate([np.linalg.norm(np.diff(x, axis=0), axis=2) for x in (tracked, hand)], axis=1)
@@ -398,10 +414,13 @@ def lazy_path(
     blocked: np.ndarray,
     validate: Callable[[int], bool],
     rounds: int,
+    glance: Callable[[Sequence[int]], Sequence[int]] | None = None,
 ) -> list[int] | None:
     """Lazy shortest path: search, validate the edges of the answer, drop what fails, search again.
 
-    `blocked` marks edges known to be invalid and is updated in place.  None after `rounds` searches without success.
+    `blocked` marks edges known to be invalid and is updated in place.  `glance` finds edges, of those it is given or
+    beside them, that are blocked for certain, in less time than it takes to validate one.  None after `rounds` searches
+    without success.
     """
     search = ShortestPaths(roadmap, start, goal, blocked)
     for _ in range(rounds):
@@ -410,10 +429,14 @@ def lazy_path(
             return None
         edges = [roadmap.edge(a, b) for a, b in itertools.pairwise(path)]
         # The ends are the tightest parts: they fail first.
-        order = sorted(range(len(edges)), key=lambda i: min(i, len(edges) - 1 - i))
-        for i in order:
-            if not validate(edges[i]):
-                blocked[edges[i]] = True
+        edges = [edges[i] for i in sorted(range(len(edges)), key=lambda i: min(i, len(edges) - 1 - i))]
+        seen = np.array(glance(edges) if glance is not None else [], dtype=int)
+        if len(seen):
+            blocked[seen[seen < len(blocked)]] = True
+            continue
+        for e in edges:
+            if not validate(e):
+                blocked[e] = True
                 break
         else:
             return path

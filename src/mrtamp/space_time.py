@@ -113,9 +113,8 @@ class Clearances:
             return
         q = np.array([[table[a], (table[a] + table[b]) / 2, table[b]] for a, b in fresh])
         flat = q.reshape(-1, q.shape[2])
-        centres = world.bounds.spheres(flat).reshape(len(fresh), 3, -1, 3)
-        R_WG, p_WG = world.tool.pose(flat)
-        R_WG, p_WG = R_WG.reshape(-1, 3, 3, 3), p_WG.reshape(-1, 3, 3)
+        centres, R_WG, p_WG = world.spheres_and_grasp(flat)
+        centres, R_WG, p_WG = centres.reshape(len(fresh), 3, -1, 3), R_WG.reshape(-1, 3, 3, 3), p_WG.reshape(-1, 3, 3)
         tracked = np.concatenate([centres, p_WG[:, :, None]], axis=2)
         # Points move neither evenly nor straight: twice the faster half, and a tenth more.
         travel = 2.2 * np.linalg.norm(np.diff(tracked, axis=1), axis=3).max(axis=(1, 2))

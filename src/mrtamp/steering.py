@@ -155,13 +155,19 @@ class Steering:
                     return False
             return True
 
+        def glance(edges: Sequence[int]) -> list[int]:
+            self.deadline.check()
+            found = self.validity.glance(robot, edges, mode)
+            self.trouble[robot, "world"] += bool(found)
+            return found
+
         for other, v in standing.items():
             # Verdicts of earlier searches hide behind the mask: they name blockers too.
             if self.validity.known(mode, (robot, mode.held.get(robot), other, v, mode.held.get(other))).hit:
                 blockers[other] += 1
         blocked = self.validity.blocked(robot, mode, standing)
         if detour:
-            path = self._past(roadmap, start, goal, blocked, validate, rounds)
+            path = self._past(roadmap, start, goal, blocked, validate, rounds, glance)
             if path is not None:
                 return path, blockers
             blocked = self.validity.blocked(robot, mode, standing)
@@ -171,7 +177,7 @@ class Steering:
             wanted = seek or (connect and not blockers)
             return self._joined(roadmap, mode, start, goal, others) if wanted else None
 
-        return self.connector.path(roadmap, start, goal, blocked, validate, rounds, join), blockers
+        return self.connector.path(roadmap, start, goal, blocked, validate, rounds, join, glance), blockers
 
     def _past(
         self,
@@ -181,6 +187,7 @@ class Steering:
         blocked: np.ndarray,
         validate: Callable[[int], bool],
         rounds: int,
+        glance: Callable[[Sequence[int]], list[int]],
     ) -> list[int] | None:
         there, back = (roadmap.distances_to(v, blocked) for v in (start, goal))
         vertices = np.array(roadmap.open_vertices())
@@ -190,8 +197,8 @@ class Steering:
         if not len(near):
             return None
         w = int(near[self.rng.integers(len(near))])
-        one = lazy_path(roadmap, start, w, blocked, validate, rounds)
-        two = lazy_path(roadmap, w, goal, blocked, validate, rounds) if one is not None else None
+        one = lazy_path(roadmap, start, w, blocked, validate, rounds, glance)
+        two = lazy_path(roadmap, w, goal, blocked, validate, rounds, glance) if one is not None else None
         return None if one is None or two is None else [*one, *two[1:]]
 
     def _joined(

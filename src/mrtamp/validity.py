@@ -7,16 +7,18 @@ in it.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from mrtamp.collision import Collision, bisection_order
+from mrtamp.collision import Collision, RobotWorld, bisection_order
 from mrtamp.modes import Attachment, Mode, static_poses
 from mrtamp.problem import Problem
 from mrtamp.roadmap import Roadmap
 
+_GLANCES = (0.5, 0.25, 0.75)
+"""Where on its edges a path is looked at, besides the vertices, before any edge is validated."""
 _SLACK = 0.012
 """Clearance (m) of bounding spheres below which Drake is asked: padding plus half a step."""
 
@@ -193,13 +195,55 @@ class Validity:
             for _, factor in unknown:
                 factor.put(e, True)
             return True
-        names = {x for pair in world.culprits(rows[i], contact, slot) for x in pair}
-        guilty = [factor for item, factor in unknown if item.name in names]
-        for factor in guilty:
+        for factor in self._guilty(world, rows[i], static, unknown, contact, slot):
             factor.put(e, False)
-        if not guilty:
-            static.put(e, False)
         return False
+
+    @staticmethod
+    def _guilty(
+        world: RobotWorld,
+        row: np.ndarray,
+        static: Label,
+        objects: list[tuple[Resting, Label]],
+        contact: str | None = None,
+        slot: str | None = None,
+    ) -> list[Label]:
+        """The factors in whose way a row of positions is: objects or, where it is none of them, all the rest."""
+        names = {x for pair in world.culprits(row, contact, slot) for x in pair}
+        return [factor for item, factor in objects if item.name in names] or [static]
+
+    def glance(self, robot: str, edges: Sequence[int], mode: Mode) -> list[int]:
+        """Edges that a few samples of some `edges`, the first of which matter most, show to be blocked in `mode`.
+
+        Where the robot cannot even be at one of their vertices, all edges of that vertex are.
+        """
+        roadmap, held = self.roadmaps[robot], mode.held.get(robot)
+        world, static = roadmap.world, self.known(mode, (robot, held, None))
+        factors = [(item, self.known(mode, (robot, held, item.chain))) for item in self.resting(mode)]
+        open_ = [
+            e
+            for e in edges
+            if (static.get(e) is None or any(factor.get(e) is None for _, factor in factors))
+            and self._contact(roadmap, e, held) == (None, None)
+        ]
+        if not open_:
+            return []
+        vertices = list(dict.fromkeys(roadmap.ends[open_].ravel().tolist()))
+        a, b = (roadmap.q[roadmap.ends[open_, k]] for k in (0, 1))
+        q = np.concatenate([roadmap.q[vertices], *(a + t * (b - a) for t in _GLANCES)])
+        rows = world.rows(q, held, {item.name: item.X_WO for item, _ in factors})
+        i = world.first_hit(rows)
+        if i < 0:
+            return []
+        if i < len(vertices):
+            around = roadmap.arcs(vertices[i])[1].tolist()
+            found = [e for e in around if self._contact(roadmap, e, held) == (None, None)]
+        else:
+            found = [open_[(i - len(vertices)) % len(open_)]]
+        for factor in self._guilty(world, rows[i], static, factors):
+            for e in found:
+                factor.put(e, False)
+        return found
 
     def _contact(self, roadmap: Roadmap, e: int, held: Attachment | None) -> tuple[str | None, str | None]:
         """The body that the load may touch along an edge that ends where it is lifted or put down, and its slot."""

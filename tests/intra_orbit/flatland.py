@@ -1,6 +1,6 @@
 """Disc robots in a plane with round obstacles, on roadmaps drawn by hand: every verdict is a distance in closed form.
 
-`Flatland` is the planner's own `Validity`, caches and all, of which only the two geometric questions are answered
+`Flatland` is the planner's own `Validity`, caches and all, of which only the geometric questions are answered
 here instead of by Drake.
 """
 
@@ -42,6 +42,10 @@ class Flatland(Validity):
         self.radius = radius
         self.obstacles = [(np.asarray(p), r) for p, r in obstacles]
         self.asked = 0
+
+    def glance(self, robot: str, edges: Sequence[int], mode: Mode) -> list[int]:
+        """Verdicts in closed form come soon enough."""
+        return []
 
     def _ask(self, robot: str, e: int, held: Attachment | None, static: Label, unknown: list) -> bool:
         assert held is None and not unknown
