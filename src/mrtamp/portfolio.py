@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -11,7 +13,8 @@ from mrtamp.collision import RESOLUTION
 from mrtamp.deadline import Deadline
 from mrtamp.effort import Effort
 from mrtamp.incumbent import Incumbent
-from mrtamp.optimise import LocalSearch, Optimiser
+from mrtamp.optimise import LocalSearch, Optimiser, Stock, tools_of
+from mrtamp.optimise.legs import order_of
 from mrtamp.optimise.nearness import Nearness
 from mrtamp.optimise.yielding import Draft, Yielding
 from mrtamp.plan import Plan, Segment, Transition
@@ -38,6 +41,8 @@ _NEARLY = 0.97
 """A plan whose current iterate costs less than the incumbent times this goes on until it is free of collision."""
 _CRAWL = 0.01
 """Share that a first round has to gain in so many programs as `_Patience` says to go on."""
+_PACE, _FURTHER = 3, 6
+"""A first round is expected to go on at the pace of its last programs for so many more."""
 _ASTRAY = 1.4
 """A plan that costs so many times the least that is possible most likely goes the wrong way around."""
 _ALIKE = 0.02
@@ -52,10 +57,13 @@ ones of local search."""
 
 _ROUNDS = 6
 """Rounds without gain after which a plan is left alone."""
+_FIRST_SEARCH = 2
+"""Rounds that have converged before the first that is local search."""
 _FIRST, _LATER = "first rounds", "later rounds"
 """What turns go to: plans that have not converged, and those that are shaken and refined again."""
-_LAST = 3.0
-"""When there is no more time than the judge takes so many times, what was gained is checked at once."""
+_LAST, _RECENT = 1.5, 6
+"""When there is no more time than the judge takes so many times, and the longest of so many programs (with what mends
+their outcome) took, what was gained is checked at once."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +92,8 @@ class _Patience:
 
 
 _OTHER_WAYS = _Patience(slow=0, hopeless=1.12, lately=5, shares=(0.5, 0.2))
-_SAME_WAYS = _Patience(slow=12, hopeless=1.01, lately=3, shares=(0.2, 0.6), same_ways=True)
-"""Where there is no choice of ways, all plans come near to each other, and bends promise more than other motions."""
+_SAME_WAYS = _Patience(slow=12, hopeless=1.02, lately=3, shares=(0.5, 0.4), same_ways=True)
+"""Where there is no choice of ways, most plans come near to each other, but with many robots a few end far below."""
 
 
 @dataclass(eq=False)
@@ -127,12 +135,21 @@ class _Entry:
         return self.optimiser.outlook if self.optimiser is not None else self.cost
 
     @property
+    def expected(self) -> float:
+        """What it is likely to cost after its first round, where there is no choice of ways; else the outlook."""
+        trail = self.trail[-_PACE - 1 :]
+        if self.rounds or not self.patience.same_ways or len(trail) <= _PACE:
+            return self.outlook
+        return self.outlook - _FURTHER * max(trail[0] - trail[-1], 0.0) / _PACE
+
+    @property
     def slow(self) -> bool:
         """Whether a first round gains so little that other plans are worth more; later rounds go on to the end."""
-        lately = self.patience.lately
+        # What has not been checked has to be good by then to go on.
+        lately = self.patience.lately * (2 if self.unchecked else 1)
         trail = self.trail[-lately:]
         clean = self.optimiser is not None and self.optimiser.cost <= (1 + _CRAWL) * self.outlook
-        return self.rounds == 0 and clean and len(trail) == lately and trail[0] - trail[-1] < _CRAWL * trail[-1]
+        return self.rounds == 0 and clean and len(trail) == lately and trail[0] - min(trail) < _CRAWL * trail[-1]
 
     @property
     def over(self) -> bool:
@@ -155,6 +172,11 @@ class _Entry:
         return bool(np.isfinite(self.estimate))
 
     @property
+    def unchecked(self) -> bool:
+        """Whether it is free of collision as far as the planner knows, and the judge has not been asked."""
+        return self.draft and not self.began_as_draft
+
+    @property
     def size(self) -> int:
         """Number of knots that a turn works on."""
         return self.optimiser.knots if self.optimiser is not None else sum(s.length for s in self.plan.segments)
@@ -172,12 +194,10 @@ class _Entry:
     @property
     def goes_ahead(self) -> bool:
         """Whether, as the incumbent, it has its turns before others: from its trial to the end of its first round of
-        finer steps, which with re-timing gain most, if it began as a draft; and to the end of its first local search
-        where there is no choice of ways.
+        finer steps, which with re-timing gain most, if it began as a draft or there is no choice of ways.
         """
-        same = self.patience.same_ways
-        begun = 0 < self.rounds <= (2 if same else 1) or (self.rounds == 0 and not self.on_trial)
-        return begun and (self.began_as_draft or same)
+        begun = self.rounds == 1 or (self.rounds == 0 and not self.on_trial)
+        return begun and (self.began_as_draft or self.patience.same_ways)
 
     @property
     def fineness(self) -> int:
@@ -187,7 +207,7 @@ class _Entry:
     @property
     def searches(self) -> bool:
         """Whether its round is local search."""
-        return self.patience.local and self.rounds > 0 and self.rounds % 2 == 0
+        return self.patience.local and self.rounds >= _FIRST_SEARCH and self.rounds % 2 == 0
 
     def is_near(self, incumbent: float) -> bool:
         """Whether it is about to beat the incumbent clearly."""
@@ -222,6 +242,8 @@ class Portfolio:
         self._entries: list[_Entry] = []
         self._settled: list[Plan] = []
         self._seen: set[float] = set()
+        self._took: deque[float] = deque(maxlen=_RECENT)
+        """Seconds that the last programs took."""
         self._contest: str | None = None
         """Which of the two had its turn last, where there was a choice."""
         self._share = 0.0
@@ -233,6 +255,7 @@ class Portfolio:
         self._coarse = 0.0
         """The least that a plan has cost after its first round, where there is no choice of ways."""
         self.nearness = Nearness(validity.collision)
+        self.stock = Stock(tools_of(self.nearness))
         self.yielding = Yielding(problem, self.nearness)
 
     def add(self, plan: Plan, *, similar: bool = False) -> bool:
@@ -241,7 +264,7 @@ class Portfolio:
         `similar`: it comes of the same search as those before, and with the same order of events it most likely becomes
         the same plan.  Then it takes the place of one that has hardly begun, or else has come too late.
         """
-        alike = [e for e in self._entries if _order(e.plan.transitions) == _order(plan.transitions)]
+        alike = [e for e in self._entries if order_of(e.plan.transitions) == order_of(plan.transitions)]
         if round(plan.cost, 6) in self._seen or any(abs(e.cost - plan.cost) < _ALIKE * plan.cost for e in alike):
             return False
         fresh = [e for e in alike if similar and e.fresh and not e.began_as_draft]
@@ -277,7 +300,7 @@ class Portfolio:
 
     def knows(self, transitions: Sequence[Transition]) -> bool:
         """Whether a plan with the same order of events is under refinement."""
-        return any(_order(e.plan.transitions) == _order(transitions) for e in self._entries)
+        return any(order_of(e.plan.transitions) == order_of(transitions) for e in self._entries)
 
     def add_drafts(self, drafts: Sequence[tuple[float, Draft]]) -> int:
         """Put motions in which robots still collide with each other under convex programming; how many are new.
@@ -333,7 +356,11 @@ class Portfolio:
             entry.optimiser = self._local_search(entry)
         if entry.optimiser is None:
             return self._shorten(entry, incumbent)
+        if entry.unchecked and isinstance(entry.optimiser, Optimiser):
+            entry.optimiser.to_beat = incumbent
+        began = time.perf_counter()
         entry.optimiser.step()
+        self._took.append(time.perf_counter() - began)
         entry.trail.append(entry.optimiser.outlook)
         due = self._due(entry, incumbent) or entry.over
         plan = self._offer(entry, incumbent, entry.optimiser) if due else None
@@ -363,7 +390,7 @@ class Portfolio:
     def _hopeful(self, entry: _Entry, incumbent: float) -> bool:
         """Whether a plan may still beat the incumbent; later rounds take off all plans about the same."""
         best = max(incumbent, self._coarse) if entry.rounds <= 1 else incumbent
-        return entry.outlook < self.patience.hopeless * best
+        return entry.expected < self.patience.hopeless * best
 
     def nearing(self, incumbent: float) -> bool:
         """Whether a plan is about to beat `incumbent` clearly."""
@@ -391,7 +418,9 @@ class Portfolio:
         """
         self._contest = None
         most = self.worth_drafting(incumbent) if self._share else np.inf
-        self._entries = [e for e in self._entries if not (e.draft and self._hopeless(e, incumbent, most))]
+        for entry in [e for e in self._entries if e.draft and self._hopeless(e, incumbent, most)]:
+            self._learn(entry)
+            self._entries.remove(entry)
         near = [e for e in self._entries if e.is_near(incumbent)]
         if near:
             return min(near, key=lambda e: e.outlook)
@@ -453,8 +482,8 @@ class Portfolio:
         return plan
 
     def _begin_convex(self, entry: _Entry, work: Refiner, *, judged: bool) -> None:
-        """Go on from the shortened plan, if the judge agrees with it, else from the plan it was made from."""
-        if not judged:
+        """Go on from the shortened plan, if it is worth a check and the judge agrees, else from the one before."""
+        if not judged and work.cost < entry.plan.cost * (1 - WORTH_CHECKING):
             plan = self.incumbent.accepted(work.segments(), work.transitions)
             if plan is not None:
                 entry.plan = plan
@@ -471,20 +500,25 @@ class Portfolio:
             entry.plan.transitions,
             self.sampler.families,
             slide=self.sliding,
-            draft=entry.draft,
+            draft=entry.draft and not entry.unchecked,
             # Finer steps beside bends gain little: they wait until a plan has proved itself.
             levels=entry.fineness,
             level=min(entry.fineness, 1),
+            deadline=self.deadline,
         )
 
     def _local_search(self, entry: _Entry) -> LocalSearch:
-        # A piece is small enough for finer steps, which with coarse ones all around gain as much.
+        # A piece is small enough for finer steps, which with coarse ones all around gain as much; but where there are
+        # many ways of other plans to try, with coarse ones it is twice as many in the time.
+        level = 0 if self.patience.same_ways and entry.rounds == _FIRST_SEARCH else 1
         plan = entry.plan
-        return LocalSearch(self.problem, self.nearness, plan.segments, plan.transitions, self.rng, level=1)
+        what = self.problem, self.nearness, plan.segments, plan.transitions, self.rng
+        return LocalSearch(*what, stock=self.stock, level=level, deadline=self.deadline)
 
     def _finish(self, entry: _Entry, incumbent: float) -> None:
         """Convergence: what was gained decides whether the plan is worth another round; a draft is given up."""
         work = entry.optimiser
+        self._learn(entry)
         if entry.draft and not self._hopeful(entry, incumbent):
             self._entries.remove(entry)
             return
@@ -507,6 +541,11 @@ class Portfolio:
         entry.trail.clear()
         entry.done, entry.refiner, entry.optimiser = True, None, None
         self._settled.append(entry.plan)
+
+    def _learn(self, entry: _Entry) -> None:
+        """Keep the ways that robots take in a plan that is done with, for the time being or for good."""
+        if entry.optimiser is not None and (entry.over or not entry.on_trial):
+            self.stock.add(*entry.optimiser.latest())
 
     def settled(self) -> list[Plan]:
         """Plans whose refinement has converged since this was last asked."""
@@ -540,7 +579,8 @@ class Portfolio:
         worth = entry.cost <= incumbent * (1 - WORTH_CHECKING)
         entry.waiting = entry.waiting + 1 if worth else 0
         patience = _LONGER if isinstance(entry.optimiser, LocalSearch) else _PATIENCE
-        last = worth and self.deadline.left_s < _LAST * self.incumbent.judging_s
+        needed = _LAST * self.incumbent.judging_s + max(self._took, default=0.0)
+        last = worth and self.deadline.left_s < needed
         due = last or entry.waiting > patience or entry.cost <= incumbent * (1 - _PLENTY)
         if due:
             entry.waiting = 0
@@ -548,7 +588,3 @@ class Portfolio:
 
     def _refiner(self, entry: _Entry) -> Refiner:
         return Refiner(entry.plan, self.validity, self.rng, entry.resolution)
-
-
-def _order(transitions: Sequence[Transition]) -> tuple:
-    return tuple((a.kind, a.robots, a.object, a.subgoal) for t in transitions for a in t.actions)

@@ -50,6 +50,40 @@ def discs(folder: Path, **keys) -> Problem:
     return replace(disc_problem(folder), **{"subgoals": (), "statics": (), "goal": (), **keys})
 
 
+def test_what_is_far_from_being_worth_it_is_not_looked_at_closely(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Far above what is to be beaten nobody asks about collisions between samples; close to it the result is sound."""
+    ends = {"a": np.array([-0.5, 0.7]), "b": np.array([0.5, 1.1])}
+    problem = discs(tmp_path, goal=tuple(RobotAt(r, q) for r, q in ends.items()))
+    e = Errands(problem).move(a=(-1.2, 0.0)).move(b=(1.2, 0.0)).move(a=(-0.5, 0.7)).move(b=(0.5, 1.1))
+    plan = e.plan()
+    free = optimiser(plan)
+    run(free)
+    looks: list[float] = []
+    look = Optimiser._violations
+
+    def counted(self: Optimiser, x, *rest):
+        looks.append(x.cost)
+        return look(self, x, *rest)
+
+    monkeypatch.setattr(Optimiser, "_violations", counted)
+    far = optimiser(plan)
+    far.to_beat = 0.8 * free.cost
+    run(far)
+    assert not looks
+    assert far.converged
+    assert far.cost == pytest.approx(plan.cost), "what has not been looked at is no result"
+    segments, transitions = far.latest()
+    assert plan_cost(segments, transitions, problem.cost) == pytest.approx(free.cost, rel=0.02)
+    near = optimiser(plan)
+    near.to_beat = 1.01 * free.cost
+    run(near)
+    assert looks and max(looks) < 1.01 * 1.05 * free.cost
+    assert near.cost == pytest.approx(free.cost, rel=0.01)
+    assert judged(near).ok
+
+
 def test_two_robots_go_straight_and_at_the_same_time(tmp_path: Path) -> None:
     weights = CostWeights(makespan=1.0, path_length=0.01)
     ends = {"a": np.array([-0.5, 0.7]), "b": np.array([0.5, 1.1])}

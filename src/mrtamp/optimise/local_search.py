@@ -1,20 +1,23 @@
-"""Iterated local search: one robot's way is bent aside at random, and convex programs show what becomes of it.
+"""Iterated local search: one robot's way is changed, and convex programs show what becomes of it.
 
-Convex programs keep to the side on which robots pass each other and what stands around.  A bend may bring a robot to
-the other side; only a piece of the plan around it is optimised anew, which takes a fraction of the time, and takes the
-place of what was there where it has become cheaper (Lourenço, Martin and Stützle, Iterated local search, 2003).
+Convex programs keep to the side on which robots pass each other and what stands around.  What brings a robot to the
+other side is a way that it took in another plan or, where there are none, a random bend; only a piece of the plan
+around it is optimised anew, which takes a fraction of the time, and takes the place of what was there where it has
+become cheaper (Lourenço, Martin and Stützle, Iterated local search, 2003).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from mrtamp.check_report import Report
+from mrtamp.deadline import Deadline
+from mrtamp.kinematics import Tool
 from mrtamp.optimise.iterate import worth
+from mrtamp.optimise.legs import Leg, Stock, Way, legs_of, order_of
 from mrtamp.optimise.nearness import Nearness
 from mrtamp.optimise.optimiser import Optimiser, first_trust
 from mrtamp.optimise.piece import Piece, Whole
@@ -33,6 +36,12 @@ _AROUND = 2.0
 """Length on both sides of a bend that is optimised with it, in first trust regions."""
 _STRAY = 0.02
 """Length (rad or m) that a way is taken to have to spare where it is straight: it may be in somebody's way."""
+_BENT = 0.2
+"""Share of random bends where there are ways of other plans to try."""
+_SHORTER, _FAVOUR = 0.1, (-3.0, 3.0)
+"""Another way is tried e times as often where it is so much shorter (rad or m), within these powers of e."""
+_SAME = 2
+"""Decimals of lengths (rad or m) by which ways are told apart."""
 _LOOK, _AHEAD, _MOST = 5, 3.0, 20
 """Programs until it is asked whether a piece becomes cheaper; those ahead that it may take at the present pace; and the
 most that a piece gets."""
@@ -41,22 +50,12 @@ _FLAT = 1e-3
 _LODGED = 0.03
 """Penetration (m) with which a piece does not go on for so many programs as until it is first looked at."""
 _VAIN = 12
-"""Bends in which the plan has to gain what is worth having."""
-
-
-@dataclass(frozen=True)
-class _Leg:
-    """Knots between which a robot goes from one of its transitions to the next, and the length it has to spare."""
-
-    robot: str
-    low: int
-    high: int
-    spare: float
+"""Changes in which the plan has to gain what is worth having."""
 
 
 @dataclass(eq=False)
 class _Trial:
-    """A piece with a bend, under convex programming."""
+    """A piece with a changed way, under convex programming."""
 
     piece: Piece
     optimiser: Optimiser
@@ -79,13 +78,14 @@ class _Trial:
 
 
 class LocalSearch:
-    """Improves one plan bend by bend; transitions stay as they are.
+    """Improves one plan way by way; transitions stay as they are.
 
     Parameters
     ----------
     nearness : measures distances in the problem's plants.
     segments, transitions : a valid plan.
-    level : how finely pieces are optimised (see `Optimiser`).
+    stock : ways that robots took in other plans, which may become more while this goes on.
+    level, deadline : how finely pieces are optimised, and until when (see `Optimiser`).
 
     Attributes
     ----------
@@ -105,27 +105,34 @@ class LocalSearch:
         transitions: Sequence[Transition],
         rng: np.random.Generator,
         *,
+        stock: Stock | None = None,
         level: int = 0,
+        deadline: Deadline | None = None,
     ) -> None:
         self.problem = problem
         self.nearness = nearness
         self.transitions = list(transitions)
         self.rng = rng
+        self.stock = stock or Stock(tools_of(nearness))
         self.level = level
+        self.deadline = deadline
         self.steps = self.knots = 0
         self._reach = first_trust(nearness)
-        self._tools = {r: w.tool for r, w in nearness.worlds.items()}
+        self._tools = tools_of(nearness)
         self._trial: _Trial | None = None
+        self._tried: set[tuple[Way, float]] = set()
+        """Ways of other plans, and how long (rad or m, roughly) the one was whose place they were to take."""
         self._take(segments)
         self._sure = self._whole
         self._costs = [self.cost]
-        """After every bend since something was last worth having."""
+        """After every change since something was last worth having."""
 
     def _take(self, segments: Sequence[Segment]) -> None:
         line = load(segments, self.transitions, self._tools)
         self._whole = Whole(line, [s.mode for s in segments], self.transitions)
         self.cost = plan_cost(self._whole.segments(), self.transitions, self.problem.cost)
-        self._legs = self._found_legs()
+        legs = legs_of(self._whole)
+        self._legs = legs if sum(x.spare for x in legs) > worth(self.level) * self.cost else []
 
     @property
     def outlook(self) -> float:
@@ -134,13 +141,18 @@ class LocalSearch:
 
     @property
     def converged(self) -> bool:
-        """Whether no way is longer than it must be, or the last bends were in vain."""
+        """Whether no way is longer than it must be, or the last changes were in vain and there is no other to try."""
         gained = self._costs[0] - self.cost
-        return not self._legs or (len(self._costs) > _VAIN and gained < worth(self.level) * self.cost)
+        vain = len(self._costs) > _VAIN and gained < worth(self.level) * self.cost
+        return not self._legs or (vain and not self._others())
 
     def segments(self) -> list[Segment]:
         """Segments of the plan as it is by now."""
         return self._whole.segments()
+
+    def latest(self) -> tuple[list[Segment], list[Transition]]:
+        """Segments and transitions of the plan as it is by now."""
+        return self.segments(), self.transitions
 
     def confirm(self) -> None:
         """The judge accepted the plan: `tighten` will not go back behind it."""
@@ -157,7 +169,7 @@ class LocalSearch:
 
     def step(self) -> float:
         """Solve one conic program; returns by how much the plan has become cheaper."""
-        trial = self._trial = self._trial or self._bent()
+        trial = self._trial = self._trial or self._changed()
         if trial is None:
             return 0.0
         scp = trial.optimiser
@@ -175,34 +187,18 @@ class LocalSearch:
         self._costs = [*self._costs, self.cost][-_VAIN - 1 :]
         return before - self.cost
 
-    # -- bends ------------------------------------------------------------------------------------------------------
+    # -- changes ----------------------------------------------------------------------------------------------------
 
-    def _found_legs(self) -> list[_Leg]:
-        """All ways that could be shorter; none if no robot has anything worth having to spare."""
-        line = self._whole.line
-        out = []
-        for robot, lengths in zip(line.columns, line.lengths(), strict=True):
-            own = [int(line.events[k]) for k, t in enumerate(self.transitions) if robot in t.active]
-            contact = {(int(line.events[s.event]), s.before): s.far for s in line.stretches if s.robot == robot}
-            q = line.of(robot)
-            for low, high in pairwise([0, *own, line.knots - 1]):
-                a, b = contact.get((low, False), low), contact.get((high, True), high)
-                if b - a >= 2:
-                    out.append(_Leg(robot, a, b, float(lengths[a:b].sum() - np.linalg.norm(q[b] - q[a]))))
-        return out if sum(x.spare for x in out) > worth(self.level) * self.cost else []
-
-    def _bent(self) -> _Trial | None:
-        """A piece of the plan with a random bend in one robot's way, where ways have more to spare more often."""
+    def _changed(self) -> _Trial | None:
+        """A piece of the plan with another way of one robot; None if all of them are straight."""
         if not self._legs:
             return None
-        line, rng = self._whole.line, self.rng
-        weights = np.array([x.spare + _STRAY for x in self._legs])
-        leg = self._legs[int(rng.choice(len(weights), p=weights / weights.sum()))]
-        along = np.concatenate([[0.0], np.cumsum(line.lengths().max(axis=0))])
-        low, high = self._part(along, leg)
+        line = self._whole.line
+        others = self._others() if self.rng.uniform() >= _BENT else []
+        robot, low, high, way = self._from_stock(others) if others else self._bent()
         q = line.q.copy()
-        part = slice(low, high + 1), line.columns[leg.robot]
-        q[part] = self._bend(leg.robot, line.q[part], along[low : high + 1])
+        q[low : high + 1, line.columns[robot]] = way
+        along = self._along()
         bounds, margin = self._whole.bounds(), _AROUND * self._reach
         first = int(np.searchsorted(along, along[low] - margin))
         last = int(np.searchsorted(along, along[high] + margin))
@@ -211,6 +207,42 @@ class LocalSearch:
         base = plan_cost(piece.segments(line.q), list(transitions), self.problem.cost)
         scp = self._optimiser(piece.segments(q), transitions, fixed_end=not piece.is_last, to_beat=base)
         return _Trial(piece, scp, base, [], [])
+
+    def _along(self) -> np.ndarray:
+        """When every knot (K,) is reached: lengths of the robots that move most."""
+        return np.concatenate([[0.0], np.cumsum(self._whole.line.lengths().max(axis=0))])
+
+    def _others(self) -> list[tuple[Leg, Way]]:
+        """Ways of other plans that have not been tried, and whose place they would take."""
+        line = self._whole.line
+        return [
+            (leg, way)
+            for leg in self._legs
+            for way in self.stock.others(leg, line.of(leg.robot)[leg.low : leg.high + 1])
+            if (way, round(leg.length, _SAME)) not in self._tried
+        ]
+
+    def _from_stock(self, others: Sequence[tuple[Leg, Way]]) -> tuple[str, int, int, np.ndarray]:
+        """Who goes another plan's way, between which knots, and the way (M, n); shorter ones more often."""
+        shorter = np.array([leg.length - way.length for leg, way in others]) / _SHORTER
+        weights = np.exp(np.clip(shorter, *_FAVOUR))
+        leg, way = others[int(self.rng.choice(len(weights), p=weights / weights.sum()))]
+        self._tried.add((way, round(leg.length, _SAME)))
+        part = slice(leg.low, leg.high + 1)
+        at_its_time = way.order == order_of(self.transitions) and self.rng.uniform() < 0.5
+        clock = self._whole.clock()[part] if at_its_time else None
+        chain = self.nearness.worlds[leg.robot].chain
+        fresh = way.instead_of(self._whole.line.of(leg.robot)[part], clock)
+        return leg.robot, leg.low, leg.high, np.clip(fresh, chain.lower, chain.upper)
+
+    def _bent(self) -> tuple[str, int, int, np.ndarray]:
+        """Whose way is bent at random, between which knots, and the way (M, n); ways with more to spare more often."""
+        weights = np.array([x.spare + _STRAY for x in self._legs])
+        leg = self._legs[int(self.rng.choice(len(weights), p=weights / weights.sum()))]
+        along = self._along()
+        low, high = self._part(along, leg)
+        way = self._whole.line.of(leg.robot)[low : high + 1]
+        return leg.robot, low, high, self._bend(leg.robot, way, along[low : high + 1])
 
     def _bend(self, robot: str, way: np.ndarray, along: np.ndarray) -> np.ndarray:
         """A way (M, n) that leads elsewhere between its ends; it is as long as `along` (M,) says."""
@@ -223,7 +255,7 @@ class LocalSearch:
             aside = _SOME * aside - rng.uniform(*_OVER) * (way - way[0] - u * (way[-1] - way[0]))
         return np.clip(way + aside, chain.lower, chain.upper)
 
-    def _part(self, along: np.ndarray, leg: _Leg) -> tuple[int, int]:
+    def _part(self, along: np.ndarray, leg: Leg) -> tuple[int, int]:
         """Knots between which a leg is bent: all of it or, as often for every order of magnitude, some of it."""
         a, b, least = along[leg.low], along[leg.high], _LEAST * self._reach
         if b - a > least:
@@ -255,4 +287,10 @@ class LocalSearch:
             draft=True,
             fixed_end=fixed_end,
             to_beat=to_beat,
+            deadline=self.deadline,
         )
+
+
+def tools_of(nearness: Nearness) -> dict[str, Tool]:
+    """The grasp frames of all robots."""
+    return {r: w.tool for r, w in nearness.worlds.items()}

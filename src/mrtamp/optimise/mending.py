@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from mrtamp.deadline import Deadline
 from mrtamp.optimise.collisions import CollisionRows, Collisions
 from mrtamp.optimise.fine import FineCheck, Violations, Who
 from mrtamp.optimise.iterate import Iterate, worth
@@ -43,9 +44,11 @@ class Mending:
     tolerance : penetration (m) that the problem tolerates at an instant.
     solve : solves one program.
     look : finds collisions.
+    deadline : when attempts are given up.
     """
 
-    def __init__(self, fine: FineCheck, tolerance: float, solve: Solve, look: Look) -> None:
+    def __init__(self, fine: FineCheck, tolerance: float, solve: Solve, look: Look, deadline: Deadline) -> None:
+        self.deadline = deadline
         self.fine = fine
         self.tolerance = tolerance
         self.solve = solve
@@ -71,6 +74,8 @@ class Mending:
         rules.level = level
         rows, found, depth = rules.rows(*where), list(violations), np.inf
         for _ in range(_PROGRAMS):
+            if self.deadline.passed:
+                return None
             rows = rows.joined(rules.more(*where, rules.learn(found, as_deep=True)))
             x = self.solve(base, rows, _NEARBY)
             if x is None or x.cost >= best:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from mrtamp.check_report import Report, Violation
+from mrtamp.deadline import Deadline
 from mrtamp.optimise.choices import Arrangement, Choices
 from mrtamp.optimise.closure import Closure, Rows, independent
 from mrtamp.optimise.collisions import CollisionRows, Collisions
@@ -64,6 +65,10 @@ def first_trust(nearness: Nearness) -> float:
     return _SLIDING if all(w.chain.prismatic.all() for w in nearness.worlds.values()) else TRUST
 
 
+_WITHIN_SIGHT = 1.05
+"""An iterate is looked at closely if it costs less than so many times what is to be beaten."""
+
+
 class Optimiser:
     """Improves one plan: same order of events, same homotopy, but everything else may move.
 
@@ -78,7 +83,8 @@ class Optimiser:
     slide : whether transitions may slide along their strata; otherwise their configurations stay as they are.
     draft : whether robots may still collide with each other in what is given.
     fixed_end : whether all robots end where they do, since it is a piece of a plan.
-    to_beat : cost below which it is worth to mend what grazes something.
+    to_beat : cost below which it is worth to mend what grazes something; it may be changed on the way.
+    deadline : when mending, which takes longer than a program, is given up.
 
     Attributes
     ----------
@@ -103,6 +109,7 @@ class Optimiser:
         draft: bool = False,
         fixed_end: bool = False,
         to_beat: float = np.inf,
+        deadline: Deadline | None = None,
     ) -> None:
         self.problem = problem
         self.weights = problem.cost
@@ -120,12 +127,13 @@ class Optimiser:
         self.converged = False
         self._stalls = 0
         self._grazing = 0
-        self.mending = Mending(self.fine, problem.collision.tolerance, self._solve, self._violations)
+        tolerance = problem.collision.tolerance
+        self.mending = Mending(self.fine, tolerance, self._solve, self._violations, deadline or Deadline())
         self._last_chances = _CHANCES
         self._trail: list[float] = []
         self._worth = np.inf
         self._promise = 0.0
-        self.collisions = Collisions(self.nearness, problem.collision.tolerance)
+        self.collisions = Collisions(self.nearness, tolerance)
         self.collisions.level = level
         self._changes = self.weights.of_changes(a.kind for t in transitions for a in t.actions)
         self.choices = Choices(problem, [s.mode for s in segments], transitions, families if slide else {})
@@ -175,6 +183,11 @@ class Optimiser:
     def segments(self) -> list[Segment]:
         """Segments of the best iterate."""
         return self._best.line.segments(self._best.q, self._best.arrangement.modes)
+
+    def latest(self) -> tuple[list[Segment], list[Transition]]:
+        """Segments and transitions of the best iterate or, if it is cheaper, the current one, which may collide."""
+        x = min(self._best, self._now, key=lambda x: x.cost)
+        return x.line.segments(x.q, x.arrangement.modes), x.arrangement.transitions
 
     def confirm(self) -> None:
         """The judge accepted the best iterate: `tighten` will not go back behind it."""
@@ -279,8 +292,10 @@ class Optimiser:
         self._now = candidate
         if candidate.line is not now.line:
             self._adopt(candidate)
-        violations = self._violations(candidate, rows.clearance) if deepest < _SHALLOW else []
-        clean = deepest < _SHALLOW and not violations
+        # What is far from being worth it is not looked at between its samples.
+        looked = candidate.cost < _WITHIN_SIGHT * self.to_beat
+        violations = self._violations(candidate, rows.clearance) if looked and deepest < _SHALLOW else []
+        clean = looked and deepest < _SHALLOW and not violations
         if violations:
             rows = rows.joined(self.collisions.more(*where, self.collisions.learn(violations)))
         falling = candidate.cost < (1 - _GAINING) * now.cost
@@ -301,8 +316,9 @@ class Optimiser:
         if clean and candidate.cost < self._best.cost - _EPS:
             gain = self._best.cost - candidate.cost
             self._best = candidate
-        self._clear_up(clean)
-        self._pace(before, after, self._promise + self._changes, clean, gaining)
+        if looked:
+            self._clear_up(clean)
+        self._pace(before, after, self._promise + self._changes, clean or not looked, gaining)
         return gain
 
     def _mended(self, x: Iterate, violations: Sequence[Violations]) -> Iterate | None:

@@ -24,6 +24,16 @@ class Whole:
         """The plan's segments."""
         return self.line.segments(self.line.q, self.modes)
 
+    def clock(self) -> np.ndarray:
+        """When every knot (K,) is reached, ascending: transition k, counted from 1, happens at k, the plan ends at one
+        more than there are; in between time goes on as the robot that moves most."""
+        line = self.line
+        bounds = np.array([0, *line.events.tolist(), line.knots - 1])
+        along = np.concatenate([[0.0], np.cumsum(np.maximum(line.lengths().max(axis=0, initial=0.0), 1e-9))])
+        stage = np.clip(np.searchsorted(bounds, np.arange(line.knots), side="right") - 1, 0, len(bounds) - 2)
+        begin, end = along[bounds[stage]], along[bounds[stage + 1]]
+        return np.asarray(stage + (along - begin) / np.maximum(end - begin, 1e-9))
+
     def bounds(self) -> np.ndarray:
         """Knots (M,), ascending, at which it may be cut: no transition and no contact motion is there."""
         line = self.line
