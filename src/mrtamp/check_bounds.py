@@ -17,7 +17,8 @@ import numpy as np
 
 Array = np.ndarray
 
-_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+"""Corners (8, 3) of the box of half sizes 1."""
 
 
 @dataclass(eq=False)
@@ -131,7 +132,7 @@ class Snapshot:
         self._R, self._p = screws.transforms(z)
         R, p = self._R[envelopes.joint], self._p[envelopes.joint]
         self.centre = np.einsum("nsab,nb->nsa", R, envelopes.centre) + p  # (n, S, 3)
-        corners = envelopes.centre[:, None] + (_SIGNS * envelopes.half[:, None]) @ envelopes.axes.swapaxes(1, 2)
+        corners = envelopes.centre[:, None] + (CORNERS * envelopes.half[:, None]) @ envelopes.axes.swapaxes(1, 2)
         self._hull = np.where(envelopes.round[:, None, None], np.tile(envelopes.ends, (1, 4, 1)), corners)
 
     def extended(self, other: Snapshot) -> Snapshot:
@@ -235,4 +236,4 @@ def _point_segment(p: Array, a: Array, u: Array) -> Array:
     return np.linalg.norm(p - a - t[:, None] * u, axis=1)
 
 
-__all__ = ["Envelopes", "Screws", "Snapshot", "capsule_around", "segment_distance"]
+__all__ = ["CORNERS", "Envelopes", "Screws", "Snapshot", "capsule_around", "segment_distance"]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mrtamp.check_bounds import CORNERS
 from mrtamp.check_report import Report, Violation
 from mrtamp.check_scene import JudgeScene
 from mrtamp.kinematics import inverse
@@ -25,8 +26,6 @@ TOUCH = 1e-3
 """A resting object is within this distance (m) of what it rests on, on either side of zero."""
 CONTACT_TRAVEL = 0.01
 """How far (m) an object may have moved against what it stood on while they are still within TOUCH."""
-
-_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 
 
 @dataclass(eq=False)
@@ -93,7 +92,7 @@ def _moved(world: JudgeScene, contact: Contact, X_FO: np.ndarray) -> float:
     worst = 0.0
     for i in world.of[contact.object]:
         solid = world.solids[i]
-        corners = _SIGNS * solid.half @ solid.X_BC[:3, :3].T + solid.X_BC[:3, 3]
+        corners = CORNERS * solid.half @ solid.X_BC[:3, :3].T + solid.X_BC[:3, 3]
         worst = max(worst, float(np.linalg.norm(corners @ difference[:3, :3].T + difference[:3, 3], axis=1).max()))
     return worst
 

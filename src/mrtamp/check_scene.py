@@ -15,7 +15,7 @@ from pydrake.geometry import Capsule, Cylinder, GeometryId, HalfSpace, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import RigidBody
 
-from mrtamp.check_bounds import Envelopes, Screws, capsule_around
+from mrtamp.check_bounds import CORNERS, Envelopes, Screws, capsule_around
 from mrtamp.check_report import Side
 from mrtamp.kinematics import quaternions
 from mrtamp.problem import WORLD, MrtampError, Problem
@@ -25,7 +25,6 @@ UNBOUNDED_SLIDE = 10.0
 """A prismatic joint without limits is judged within this many metres of zero."""
 
 _UNKNOWN = np.full(3, np.nan)
-_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +232,7 @@ class JudgeScene:
                 radii = np.full(2, shape.radius())
             else:
                 box = inspector.GetObbInGeometryFrame(g)
-                points = (box.pose().multiply((_CORNERS * box.half_width()).T)).T
+                points = (box.pose().multiply((CORNERS * box.half_width()).T)).T
                 radii = np.zeros(8)
             obb = inspector.GetObbInGeometryFrame(g)
             if obb is not None:

@@ -15,7 +15,7 @@ MECHANISMS = {
     "coordination": "motions of a new plan begin as early as the others allow",
     "refinement": "optimisation of plans once there are some",
     "convex-programming": "the second half of refinement; without it plans are only shortened robot by robot",
-    "local-search": "ways of refined plans are bent aside at random, to pass on another side",
+    "local-search": "ways of refined plans are bent aside, or taken from other plans, to pass on another side",
     "drafts": "skeletons are refined as they are, robots still in each other's way; without it only what is free",
     "sliding": "transitions move along their strata in refinement",
     "adoption": "refined configurations go back into the roadmaps and the tree",

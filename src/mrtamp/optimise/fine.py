@@ -59,10 +59,9 @@ class FineCheck:
 
     def _points(self, robot: str, x: np.ndarray) -> np.ndarray:
         """Where tracked points (n, P, 3) of a robot are in configurations x (n, N)."""
-        world = self.nearness.worlds[robot]
-        R, p = world.tool.pose(x)
+        spheres, R, p = self.nearness.worlds[robot].spheres_and_grasp(x)
         hand = p[:, None] + np.einsum("nij,kj->nki", R, 0.1 * np.eye(3))
-        return np.concatenate([world.bounds.spheres(x), hand], axis=1)
+        return np.concatenate([spheres, hand], axis=1)
 
     def _travel(self, line: Polyline, q: np.ndarray) -> dict[str, np.ndarray]:
         """How far (m) tracked points of every robot move in every step (K - 1,)."""

@@ -90,7 +90,7 @@ class LocalSearch:
     Attributes
     ----------
     cost : cost of the plan as it is by now.
-    converged : whether further bends promise little.
+    converged : whether further changes promise little.
     steps : conic programs solved so far.
     knots : number of knots that the last of them was about.
     """
@@ -198,7 +198,7 @@ class LocalSearch:
         robot, low, high, way = self._from_stock(others) if others else self._bent()
         q = line.q.copy()
         q[low : high + 1, line.columns[robot]] = way
-        along = self._along()
+        along = self._whole.line.along()
         bounds, margin = self._whole.bounds(), _AROUND * self._reach
         first = int(np.searchsorted(along, along[low] - margin))
         last = int(np.searchsorted(along, along[high] + margin))
@@ -207,10 +207,6 @@ class LocalSearch:
         base = plan_cost(piece.segments(line.q), list(transitions), self.problem.cost)
         scp = self._optimiser(piece.segments(q), transitions, fixed_end=not piece.is_last, to_beat=base)
         return _Trial(piece, scp, base, [], [])
-
-    def _along(self) -> np.ndarray:
-        """When every knot (K,) is reached: lengths of the robots that move most."""
-        return np.concatenate([[0.0], np.cumsum(self._whole.line.lengths().max(axis=0))])
 
     def _others(self) -> list[tuple[Leg, Way]]:
         """Ways of other plans that have not been tried, and whose place they would take."""
@@ -239,7 +235,7 @@ class LocalSearch:
         """Whose way is bent at random, between which knots, and the way (M, n); ways with more to spare more often."""
         weights = np.array([x.spare + _STRAY for x in self._legs])
         leg = self._legs[int(self.rng.choice(len(weights), p=weights / weights.sum()))]
-        along = self._along()
+        along = self._whole.line.along()
         low, high = self._part(along, leg)
         way = self._whole.line.of(leg.robot)[low : high + 1]
         return leg.robot, low, high, self._bend(leg.robot, way, along[low : high + 1])

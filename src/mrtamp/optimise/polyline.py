@@ -85,6 +85,10 @@ class Polyline:
         q = self.q if q is None else q
         return np.array([np.linalg.norm(np.diff(q[:, c], axis=0), axis=1) for c in self.columns.values()])
 
+    def along(self) -> np.ndarray:
+        """When every knot (K,) is reached: lengths of the robots that move most, added up."""
+        return np.concatenate([[0.0], np.cumsum(self.lengths().max(axis=0))])
+
     def parts(self, q: np.ndarray) -> list[dict[str, np.ndarray]]:
         """Waypoints per segment and robot for knots q (K, N)."""
         bounds = [0, *self.events.tolist(), self.knots - 1]
@@ -115,7 +119,7 @@ class Polyline:
         for s in self.stretches:
             anchors |= {s.far, s.near}
         deviation = _DEVIATION / 4**level
-        along = np.concatenate([[0.0], np.cumsum(self.lengths().max(axis=0))])
+        along = self.along()
         out: list[float] = [0.0]
         i = 0
         while i < self.knots - 1:
