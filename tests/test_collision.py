@@ -209,6 +209,29 @@ def test_pairs_agree_in_both_orders(problem: Problem, collision: Collision) -> N
     assert hits != loaded
 
 
+def test_what_beads_prove_apart_does_not_collide(problem: Problem, collision: Collision) -> None:
+    """Many rows at once, some of which Drake is not asked about, have the verdicts that each has alone."""
+    rng = np.random.default_rng(1)
+    n = 400
+    qa, qb = (
+        np.column_stack([rng.uniform(-0.3, 0.3, (n, 2)), rng.uniform(0.2, 0.6, n), rng.uniform(-3, 3, n)])
+        for _ in range(2)
+    )
+    pair, _ = collision.pair("left", "right")
+    for held in (None, grasp("bar", "left", offset=0.05)):
+        alone = [pair.first_hit(a[None], held, b[None], None) for a, b in zip(qa, qb, strict=True)]
+        before = pair.counts.collision_checks
+        i, found = 0, []
+        while i < n:
+            hit = pair.first_hit(qa[i:], held, qb[i:], None)
+            found += [-1] * (n - i) if hit < 0 else [-1] * hit + [0]
+            i = len(found)
+        assert found == alone and 0 in found
+        assert pair.counts.collision_checks - before < 0.7 * n, "most that are far apart are not asked about"
+        known = tuple(w.posed(q, h) for w, q, h in zip(pair.worlds, (qa, qb), (held, None), strict=True))
+        assert pair.first_hit(qa, held, qb, None, posed=known) == found.index(0)
+
+
 def test_arms_are_padded_between_robots_by_3_mm_and_hands_are_not(problem: Problem, collision: Collision) -> None:
     """All of the gantry that can touch is its hand, so palms meet exactly: 12 cm of width."""
     pair, _ = collision.pair("left", "right")

@@ -83,3 +83,44 @@ def test_where_there_is_no_way_there_is_no_path(tmp_path: Path) -> None:
     roadmap = parts.roadmaps["a"]
     assert Connector(parts.validity, parts.rng).connect(roadmap, parts.root, 0, inside, 200) is None
     assert not roadmap.joined
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_way_that_may_only_be_so_long_is_within_its_ellipse(tmp_path: Path, seed: int) -> None:
+    """Past the post's end at (0, 0.7) it is 2 sqrt(1 + 0.49) = 2.44 from end to end, where the disc just fits."""
+    parts = Parts(arena(tmp_path, {"a": (-1, 0)}, walls=POST), seed=seed)
+    roadmap, beyond = parts.roadmaps["a"], parts.vertex("a", (1, 0))
+    connector = Connector(parts.validity, parts.rng)
+    assert connector.connect(roadmap, parts.root, 0, beyond, 300, longest=2.43) is None
+    assert roadmap.n_vertices == 2
+    path = connector.connect(roadmap, parts.root, 0, beyond, 1000, longest=2.8)
+    assert path is not None and free(parts, path)
+    q = roadmap.q[path]
+    assert max(np.linalg.norm(q - q[0], axis=1) + np.linalg.norm(q - q[-1], axis=1)) <= 2.8 + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_who_knows_a_long_way_only_looks_for_a_shorter_one(tmp_path: Path, seed: int) -> None:
+    """The roadmap goes around a wall that has a doorway."""
+    walls = [wall("below", (-0.1, -1.6), (0.1, 0.2)), wall("above", (-0.1, 0.8), (0.1, 2.2))]
+    parts = Parts(arena(tmp_path, {"a": (-1, 0)}, walls=walls), seed=seed)
+    roadmap, beyond = parts.roadmaps["a"], parts.vertex("a", (1, 0))
+    corners = [parts.vertex("a", (x, -1.85)) for x in (-0.5, 0.5)]
+    around = [0, *corners, beyond]
+    assert free(parts, around)
+    steering = parts.insertion().steering
+
+    def length(path: list[int] | None) -> float:
+        assert path is not None and free(parts, path)
+        return float(np.linalg.norm(np.diff(roadmap.q[path], axis=0), axis=1).sum())
+
+    at = (0,)
+    assert steering.path(parts.root, at, "a", beyond, connect=False)[0] == around
+    steering.thorough, steering.shorter = True, False
+    assert steering.path(parts.root, at, "a", beyond)[0] == around, "switched off"
+    steering.shorter = True
+    found = min(length(steering.path(parts.root, at, "a", beyond)[0]) for _ in range(4))
+    assert found <= 0.8 * length(around)
+    known = roadmap.n_vertices
+    assert length(steering.path(parts.root, at, "a", corners[0])[0]) < 2.0
+    assert roadmap.n_vertices == known, "short ways are not looked at twice"

@@ -76,7 +76,10 @@ def moves_plug(plan: Plan) -> bool:
 
 
 def test_guidance_disfavours_the_detour_and_the_planner_finds_it_all_the_same(tmp_path: Path) -> None:
-    """Skeletons are off only as their turns would make the run longer; seeds 2 and 3 take 57 and 8 iterations."""
+    """Skeletons are off only as their turns would make the run longer.
+
+    How soon it is found is chance: of seeds 1 to 16 twelve once found it within 400 iterations, half of them within 80.
+    """
     options = Options(persistent=0.5, refinement_share=0.2, without=frozenset({"skeletons", "convex-programming"}))
     planner = Planner(plugged(tmp_path), seed=2, options=options)
     start = planner.root.mode

@@ -6,13 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from arena import arena, visit
+from arena import arena, visit, wall
 from discs import RADIUS, Errands
 
 from mrtamp.check import check_plan
+from mrtamp.check_report import Report, Side, Violation
 from mrtamp.plan import Plan
 from mrtamp.planner import Options, Planner
 from mrtamp.problem import AtConfiguration, Problem, Subgoal
+from mrtamp.space_time import SpaceTime
 
 
 def meeting(folder: Path, gap: float) -> Problem:
@@ -58,3 +60,31 @@ def test_a_plan_that_is_adopted_is_in_the_tree_knot_by_knot(tmp_path: Path) -> N
         for robot, q in its.q.items():
             np.testing.assert_array_equal(mine.q[robot], q)
     assert all(g.n_vertices > before[r] for r, g in planner.roadmaps.items()), "knots are roadmap vertices"
+
+
+def test_an_edge_on_which_the_judge_sees_a_robot_hit_the_world_is_not_taken_again(tmp_path: Path) -> None:
+    """The schedule is made anew, on another way."""
+    problem = arena(tmp_path, {"a": (-1, 0)}, {"a": (1, 0)}, walls=[wall("above", (-0.1, 1.2), (0.1, 2.2))])
+    planner = Planner(problem)
+    growth, robot = planner.growth, "a"
+
+    def schedule() -> SpaceTime:
+        timed = growth.insertion.realise(
+            planner.root.mode, {robot: planner.root.at[0]}, [], [], lambda k, mode: None, growth.goal_vertices
+        )
+        assert timed is not None and growth.insertion.schedule is not None
+        return growth.insertion.schedule
+
+    first = schedule()
+    sides = (Side("robot", robot, "disc"), Side("static", "above", "above"))
+    report = Report([Violation("collision", "deep", segment=0, step=0, fraction=0.5, value=0.02, sides=sides)])
+    move = first.moves[robot][0]
+    edge = growth.insertion.edge_of(robot, move)
+    assert edge is not None
+    e = planner.roadmaps[robot].edge(*edge)
+    assert planner.validity.edge(robot, e, planner.root.mode)
+    assert growth.refuted(report, first)
+    assert not planner.validity.edge(robot, e, planner.root.mode)
+    second = schedule()
+    assert growth.insertion.edge_of(robot, second.moves[robot][0]) != edge
+    assert not growth.refuted(Report([Violation("goal", "not there")]), second), "nothing to learn from"

@@ -86,6 +86,29 @@ def test_the_incumbent_has_its_second_round_before_others_have_their_trial(tmp_p
     assert portfolio._choose(best.cost) is not entry, "now it is the other's turn"
 
 
+def test_an_incumbent_far_above_what_skeletons_promise_is_challenged_before_its_second_round(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    portfolio, best = planner.portfolio, roundabout(planner, 0.6)
+    portfolio.add_drafts([(best.cost, portfolio.yielding.time(best.segments, best.transitions))])
+    [entry] = portfolio._entries
+
+    def poor(times: float) -> bool:
+        """As if skeletons promised that the incumbent costs so many times as much as it could."""
+        planner.skeletons.bound = portfolio.bound = best.cost / times
+        return planner._poor(best.cost)
+
+    assert not poor(1.2), "its first round is not over"
+    while not entry.done:
+        best = portfolio.improve(best.cost) or best
+    assert portfolio.add(roundabout(planner, -0.9))
+    assert not poor(1.1) and portfolio._choose(best.cost) is entry
+    assert poor(1.2) and portfolio._choose(best.cost) is not entry
+    assert not poor(1.2), "skeletons had their turn"
+    portfolio.suit(choice=False)
+    entry.patience = portfolio.patience
+    assert portfolio._choose(best.cost) is entry, "there are no other ways"
+
+
 def test_drafts_begin_with_the_most_promising_whatever_they_seem_to_cost(tmp_path: Path) -> None:
     planner = planner_for(tmp_path)
     portfolio = planner.portfolio

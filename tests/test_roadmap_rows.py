@@ -78,3 +78,14 @@ def test_full_tables_are_emptied_and_filled_again(parts: Parts, monkeypatch: pyt
     # In another order, so that rows of before would mean something else.
     np.testing.assert_array_equal(along(rows, [3, 1, 0])[::-1][[0, -1]], q[[0, -1]])
     np.testing.assert_array_equal(along(rows, [0, 1, 3]), q)
+
+
+def test_the_edge_of_a_move_is_known(parts: Parts) -> None:
+    rows = rows_of(parts)
+    start = rows.clearances.row("a", parts.roadmaps["a"].q[0])
+    vertices = [0, 2, 1, 3]
+    path = rows.path("a", vertices, start)
+    edges = list(dict.fromkeys(rows.edge_of("a", i, j) for i, j in itertools.pairwise(path)))
+    assert edges == list(itertools.pairwise(vertices))
+    assert rows.edge_of("a", path[-1], path[-1]) == (3, 3), "standing at a vertex"
+    assert rows.edge_of("a", path[2], path[0]) is None and rows.edge_of("b", path[0], path[1]) is None

@@ -164,8 +164,8 @@ def test_a_step_that_the_judge_objected_to_is_not_taken_again(tmp_path: Path) ->
     end = t.time.end
     sides = (Side("robot", "a", "disc"), Side("robot", "b", "disc"))
     step = Violation("collision", "they graze", segment=0, step=2, fraction=0.5, value=1e-3, sides=sides)
-    assert t.time.forbid(Report([step]))
-    assert not t.time.forbid(Report([Violation("goal", "not there")])), "nothing to learn from"
+    assert t.time.forbid(Report([step])) == (True, [])
+    assert t.time.forbid(Report([Violation("goal", "not there")])) == (False, []), "nothing to learn from"
     again = SpaceTime(t.clearances, {r: t.clearances.tables[r][0] for r in "ab"}, [t.mode])
     again.at = {r: 0 for r in "ab"}
     rows = {r: [m.a for m in t.time.moves[r]] + [t.time.at[r]] for r in "ab"}
@@ -179,3 +179,29 @@ def test_copies_are_independent(tmp_path: Path) -> None:
     trial = t.time.copy()
     assert trial.insert(t.leg("b", (0, 1)))
     assert not t.time.moves["b"] and t.time.end < trial.end
+
+
+def hits(robot: str, step: int, depth: float) -> Violation:
+    """What the judge says of a robot that hits a wall in a step."""
+    sides = (Side("robot", robot, "disc"), Side("static", "wall", "wall"))
+    return Violation("collision", "deep", segment=0, step=step, fraction=0.5, value=depth, sides=sides)
+
+
+def test_a_robot_that_hits_the_world_alone_is_to_blame_for_it(tmp_path: Path) -> None:
+    t = Timing(tmp_path, {"a": (-1, 0.5), "b": (-1, -0.5)})
+    assert t.go("a", (1, 0.5)) and t.go("b", (1, -0.5))
+    learnt, alone = t.time.forbid(Report([hits("a", 2, 0.02), hits("b", 4, 0.02)]))
+    assert not learnt, "nothing that other timings of the same moves could change"
+    assert alone == [(robot, t.time.moves[robot][k], t.mode, "wall") for robot, k in (("a", 2), ("b", 4))]
+
+
+def test_robots_whose_penetrations_only_add_up_to_too_much_do_not_hit_the_world_at_the_same_time(
+    tmp_path: Path,
+) -> None:
+    t = Timing(tmp_path, {"a": (-1, 0.5), "b": (-1, -0.5)})
+    assert t.go("a", (1, 0.5)) and t.go("b", (1, -0.5))
+    both = {r: t.time.moves[r][2] for r in "ab"}
+    assert t.clearances.apart("a", both["a"], None, "b", both["b"], None)
+    assert t.time.forbid(Report([hits("a", 2, 0.007), hits("b", 2, 0.004)])) == (True, [])
+    assert not t.clearances.apart("a", both["a"], None, "b", both["b"], None)
+    assert t.clearances.apart("a", both["a"], None, "b", t.time.moves["b"][3], None)

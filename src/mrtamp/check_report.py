@@ -5,7 +5,7 @@ Violations are data as well as text, so that a planner can repair the interval i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -60,6 +60,18 @@ class Violation:
     fraction: float | None = None
     value: float | None = None
     sides: tuple[Side, Side] | None = None
+
+    def guilty(self, carriers: Mapping[str, str], robots: Collection[str]) -> tuple[tuple[str, ...], str | None]:
+        """The one or two of `robots` that a collision is about, and what a single one hit: maybe itself.
+
+        `carriers` maps objects that are held to who holds them; a load counts with its carrier.
+        """
+        owners = [carriers.get(s.owner, s.owner) for s in self.sides or ()]
+        found = tuple(dict.fromkeys(o for o in owners if o in robots))
+        obstacles = [o for o in owners if o not in robots]
+        if not found or self.kind != "collision":
+            return found, None
+        return found, obstacles[0] if obstacles else found[0]
 
     def __str__(self) -> str:
         return f"{self.kind}: {self.message}{self._where()}"

@@ -11,20 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
-from pydrake.geometry import (
-    Box,
-    Capsule,
-    CollisionFilterDeclaration,
-    Cylinder,
-    GeometrySet,
-    PenetrationAsPointPair,
-    QueryObject,
-    Sphere,
-)
+from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, PenetrationAsPointPair, QueryObject
 
-from mrtamp.kinematics import Chain, Tool, quaternions
+from mrtamp.bounding import Balls, body_radius, robot_bounds
+from mrtamp.kinematics import Tool, quaternions
 from mrtamp.modes import Attachment
 from mrtamp.problem import MovableObject, Problem
 from mrtamp.scene import Scene, build_scene, chain_of, geometry_ids, gripper_bodies, robot_bodies
@@ -35,6 +28,10 @@ PADDING = 0.003
 """Growth (m) of the arms' collision shapes in queries between two robots."""
 CONTACT_DEPTH = 1e-3
 """Penetration (m) up to which an object counts as touching what it is lifted from or put on."""
+_SURE = 1e-3
+"""Distance (m) beyond their padding at which beads prove shapes apart, in single precision."""
+_FEW = 3
+"""Rows up to which it takes longer to place beads than to ask Drake."""
 _FAR = 50.0
 
 
@@ -90,54 +87,14 @@ def _slots(problem: Problem, prefix: str) -> tuple[dict[str, MovableObject], dic
     return slots, slot_of
 
 
-def geometry_bound(scene: Scene, body_geometries: Sequence) -> tuple[np.ndarray, float]:
-    """Centre (3,) in the body frame and radius (m) of a sphere around some collision geometries of one body."""
-    inspector = scene.scene_graph.model_inspector()
-    corners = []
-    for g in body_geometries:
-        X = inspector.GetPoseInFrame(g).GetAsMatrix4()
-        shape = inspector.GetShape(g)
-        if isinstance(shape, Sphere):
-            half, extra = np.zeros(3), shape.radius()
-        elif isinstance(shape, Capsule):
-            half, extra = np.array([0, 0, shape.length() / 2]), shape.radius()
-        elif isinstance(shape, Cylinder):
-            half, extra = np.array([shape.radius(), shape.radius(), shape.length() / 2]), 0.0
-        elif isinstance(shape, Box):
-            half, extra = shape.size() / 2, 0.0
-        else:
-            hull = inspector.GetConvexHull(g)
-            if hull is None:
-                continue
-            points = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
-            corners += [(X[:3, :3] @ p + X[:3, 3], 0.0) for p in points]
-            continue
-        for signs in np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T:
-            corners.append((X[:3, :3] @ (signs * half) + X[:3, 3], extra))
-    if not corners:
-        return np.zeros(3), 0.0
-    points = np.array([c[0] for c in corners])
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    return centre, float(max(np.linalg.norm(p - centre) + e for p, (_, e) in zip(points, corners, strict=True)))
+class Posed(NamedTuple):
+    """A robot at N configurations: N stacks of its beads and a ball around what it holds, and the poses (N, 7) of that.
 
+    `loads` is None where it holds nothing, see `load_poses`.
+    """
 
-@dataclass
-class Bounds:
-    """Bounding spheres of a robot's bodies: the cheap first answer, and the points that set an edge's resolution."""
-
-    chain: Chain
-    bodies: list[str]
-    centres: np.ndarray
-    radii: np.ndarray
-
-    def spheres(self, q: np.ndarray) -> np.ndarray:
-        """World centres (N, B, 3) at configurations q (N, n)."""
-        R, p = self.chain.poses(q, self.bodies)
-        return self.moved(R, p)
-
-    def moved(self, R: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """World centres (N, B, 3) where the bodies are at R (B, N, 3, 3), p (B, N, 3)."""
-        return np.swapaxes(p + np.einsum("bnij,bj->bni", R, self.centres), 0, 1)
+    balls: Balls
+    loads: np.ndarray | None
 
 
 class RobotWorld:
@@ -179,8 +136,8 @@ class RobotWorld:
         template[self.in_scene.fingers] = self.in_scene.finger_positions(None)
         template[self.in_scene.arm] = self.home
         self._template = template
-        self.bounds = _robot_bounds(scene, name, self.chain)
-        self.object_radius = {o: _body_radius(scene, o) for o in resting}
+        self.bounds, self.beads = robot_bounds(scene, name, self.chain)
+        self.object_radius = {o: body_radius(scene, o) for o in resting}
         self._pose7: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def rows(self, q: np.ndarray, held: Attachment | None, objects: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -198,9 +155,18 @@ class RobotWorld:
     def spheres_and_grasp(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Centres (N, B, 3) of the bodies' spheres, and R_WG (N, 3, 3), p_WG (N, 3), at configurations q (N, n)."""
         Rs, ps, _ = self.chain.sweep(q)
-        rows = [self.chain.index[b] for b in self.bounds.bodies]
-        centres = self.bounds.moved(np.stack([Rs[i] for i in rows]), np.stack([ps[i] for i in rows]))
-        return centres, *self.tool.carried(Rs, ps)
+        return self.bounds.placed(Rs, ps), *self.tool.carried(Rs, ps)
+
+    def posed(self, q: np.ndarray, held: Attachment | None) -> Posed:
+        """The robot, with what it holds, at configurations q (N, n)."""
+        Rs, ps, _ = self.chain.sweep(q)
+        # Many are kept: single precision will do.
+        centres, radii = self.beads.placed(Rs, ps).astype(np.float32), self.beads.radii
+        if held is None:
+            return Posed(Balls(centres, radii), None)
+        loads = _carried(*self.tool.carried(Rs, ps), held)
+        centres = np.concatenate([centres, loads[:, None, 4:].astype(np.float32)], axis=1)
+        return Posed(Balls(centres, np.append(radii, self.object_radius[held.object])), loads)
 
     def _seven(self, X: np.ndarray) -> np.ndarray:
         known = self._pose7.get(id(X))
@@ -284,9 +250,9 @@ class RobotPair:
         qb: np.ndarray,
         held_b: Attachment | None,
         widths: tuple[float | None, float | None] = (None, None),
-        loads: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
+        loads: Sequence[np.ndarray | None] = (None, None),
     ) -> np.ndarray:
-        """Position vectors (N, nq) of the plant; see `first_hit`."""
+        """Position vectors (N, nq) of the plant; see `first_hit`; `loads` as in `Posed`."""
         rows = np.repeat(self._template[None], len(qa), axis=0)
         for i, (q, held) in enumerate(((qa, held_a), (qb, held_b))):
             in_scene = self.scene.robots[self.worlds[i].name]
@@ -307,18 +273,29 @@ class RobotPair:
         held_b: Attachment | None,
         widths: tuple[float | None, float | None] = (None, None),
         exact: np.ndarray | None = None,
-        loads: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
+        posed: tuple[Posed | None, Posed | None] = (None, None),
     ) -> int:
         """Index of the first pair of rows of qa (N, na), qb (N, nb) in collision, or -1.
 
         `widths` are the openings (m) of hands that hold nothing; None: fully open.  `exact` (N,) says at which rows the
         robots may stand: there the shapes count as they are, without padding, which is for motion between samples.
-        `loads` are the poses of what is held (N, 7), see `load_poses`, where they are known already.
+        `posed` are the robots at those rows, see `RobotWorld.posed`, where that is known already.
         """
-        rows = self.rows(qa, held_a, qb, held_b, widths, loads)
+        one, two = posed
+        index = np.arange(len(qa))
+        loads: tuple[np.ndarray | None, ...] = (None, None)
+        if len(qa) > _FEW or (one is not None and two is not None):
+            # What beads prove apart Drake is not asked about.
+            one = self.worlds[0].posed(qa, held_a) if one is None else one
+            two = self.worlds[1].posed(qb, held_b) if two is None else two
+            index = np.flatnonzero(one.balls.near(two.balls, 2 * PADDING + _SURE))
+            if not len(index):
+                return -1
+            loads = tuple(None if x.loads is None else x.loads[index] for x in (one, two))
+        rows = self.rows(qa[index], held_a, qb[index], held_b, widths, loads)
         plant, context, port = self._plant, self.context, self._port
         lenient = self.tolerance > 0
-        for i, row in enumerate(rows):
+        for i, row in zip(index.tolist(), rows, strict=True):
             plant.SetPositions(context, row)
             self.counts.collision_checks += 1
             query = port.Eval(context)
@@ -366,8 +343,12 @@ def write_held(scene: Scene, rows: np.ndarray, slot: str, tool: Tool, q: np.ndar
 
 def load_poses(tool: Tool, q: np.ndarray, held: Attachment) -> np.ndarray:
     """World poses (N, 7) of what is held at configurations q (N, n): quaternion (w, x, y, z), then position."""
-    R, p = tool.pose(q)
-    return np.concatenate([quaternions(R @ held.X_PO[:3, :3]), p + R @ held.X_PO[:3, 3]], axis=1)
+    return _carried(*tool.pose(q), held)
+
+
+def _carried(R_WG: np.ndarray, p_WG: np.ndarray, held: Attachment) -> np.ndarray:
+    """World poses (N, 7) of what is held by hands at R_WG (N, 3, 3), p_WG (N, 3)."""
+    return np.concatenate([quaternions(R_WG @ held.X_PO[:3, :3]), p_WG + R_WG @ held.X_PO[:3, 3]], axis=1)
 
 
 def _owners(scene: Scene) -> dict:
@@ -378,31 +359,6 @@ def _owners(scene: Scene) -> dict:
     for name, bodies in [*scene.statics.items(), *scene.free_bodies.items()]:
         out.update(dict.fromkeys(geometry_ids(scene.plant, bodies), name))
     return out
-
-
-def _body_radius(scene: Scene, name: str) -> float:
-    """Radius (m) around the body's origin that holds a free body."""
-    centre, radius = geometry_bound(scene, geometry_ids(scene.plant, scene.free_bodies[name]))
-    return float(np.linalg.norm(centre)) + radius
-
-
-def _robot_bounds(scene: Scene, name: str, chain: Chain) -> Bounds:
-    in_scene = scene.robots[name]
-    gripper = in_scene.robot.model.gripper
-    moving = set(gripper.bodies) if gripper else set()
-    names, centres, radii = [], [], []
-    for body in robot_bodies(scene.plant, in_scene):
-        geometries = scene.plant.GetCollisionGeometriesForBody(body)
-        if not geometries or body.name() not in chain.index:
-            continue
-        centre, radius = geometry_bound(scene, geometries)
-        # The chain shows fingers fully open; they close by at most this much.
-        travel = max((abs(f) for f in gripper.joints.values()), default=0.0) * gripper.max_width if gripper else 0.0
-        extra = travel if body.name() in moving else 0.0
-        names.append(body.name())
-        centres.append(centre)
-        radii.append(radius + extra)
-    return Bounds(chain, names, np.array(centres), np.array(radii))
 
 
 @dataclass
@@ -436,10 +392,10 @@ class Collision:
         held_b: Attachment | None,
         widths: tuple[float | None, float | None] = (None, None),
         exact: np.ndarray | None = None,
-        loads: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
+        posed: tuple[Posed | None, Posed | None] = (None, None),
     ) -> int:
         """`RobotPair.first_hit` for two robots, whichever comes first in their plant."""
         pair, swapped = self.pair(a, b)
         if swapped:
-            return pair.first_hit(qb, held_b, qa, held_a, widths[::-1], exact, loads[::-1])
-        return pair.first_hit(qa, held_a, qb, held_b, widths, exact, loads)
+            return pair.first_hit(qb, held_b, qa, held_a, widths[::-1], exact, posed[::-1])
+        return pair.first_hit(qa, held_a, qb, held_b, widths, exact, posed)

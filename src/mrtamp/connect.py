@@ -13,6 +13,7 @@ import numpy as np
 
 from mrtamp.collision import bisection_order
 from mrtamp.deadline import Deadline
+from mrtamp.informed import ellipsoid_sample
 from mrtamp.modes import Attachment, Mode
 from mrtamp.roadmap import Roadmap, lazy_path
 from mrtamp.transitions.projection import uniform_configurations
@@ -86,11 +87,13 @@ class Connector:
         b: int,
         iterations: int,
         standing: Mapping[str, np.ndarray] | None = None,
+        longest: float = np.inf,
     ) -> list[int] | None:
         """Join two vertices by a path that is free of the robot's own world in `mode`; its vertices, None without one.
 
         Contact vertices are joined from the far ends of their chains, which the path includes unseen.  `standing` are
-        configurations of other robots that the path has to keep clear of as well.
+        configurations of other robots that the path has to keep clear of as well.  Knots are such that the way from end
+        to end by any one of them is no longer than `longest`.
 
         Raises
         ------
@@ -113,11 +116,21 @@ class Connector:
         reach = _REACH * float(np.mean(np.minimum(world.chain.upper - world.chain.lower, 2.0)))
         if not all(free(roadmap.q[v], roadmap.q[v]) for v in (start, goal)):
             return None
-        one, two = _Tree(roadmap.q[start]), _Tree(roadmap.q[goal])
+        ends = roadmap.q[[start, goal]]
+
+        def by_way_of(q: np.ndarray) -> float:
+            return float(np.linalg.norm(q - ends, axis=1).sum()) if longest < np.inf else 0.0
+
+        def sample() -> np.ndarray:
+            if longest == np.inf:
+                return uniform_configurations(world.tool, self.rng, 1)[0]
+            return np.clip(ellipsoid_sample(ends[0], ends[1], longest, self.rng), world.chain.lower, world.chain.upper)
+
+        one, two = _Tree(ends[0]), _Tree(ends[1])
         for k in range(iterations):
             self.deadline.check()
             here, there = (one, two) if k % 2 == 0 else (two, one)
-            target = uniform_configurations(world.tool, self.rng, 1)[0] if k > 1 else there.q[0]
+            target = sample() if k > 1 else there.q[0]
             i = here.nearest(target)
             d = target - here.q[i]
             length = float(np.linalg.norm(d))
@@ -127,13 +140,15 @@ class Connector:
                 q = here.q[i] + (q - here.q[i]) / 2
                 if not free(here.q[i], q, coarse=True):
                     continue
+            if by_way_of(q) > longest:
+                continue
             i = here.add(q, i)
             j = there.nearest(q)
             while True:
                 d = q - there.q[j]
                 length = float(np.linalg.norm(d))
                 step = there.q[j] + d * min(1.0, reach / max(length, 1e-12))
-                if not free(there.q[j], step, coarse=True):
+                if by_way_of(step) > longest or not free(there.q[j], step, coarse=True):
                     break
                 j = there.add(step, j)
                 if length <= reach:

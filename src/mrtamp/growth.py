@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mrtamp.check import Report
-from mrtamp.check_report import Violation
 from mrtamp.deadline import Deadline
 from mrtamp.graphs import Graphs
 from mrtamp.insertion import Insertion
@@ -22,6 +21,7 @@ from mrtamp.modes import Mode, goal_mode
 from mrtamp.plan import Segment, Transition, without_detours
 from mrtamp.problem import MrtampError, Problem
 from mrtamp.roadmap import Roadmap, add_stations
+from mrtamp.space_time import SpaceTime
 from mrtamp.steering import Steering
 from mrtamp.tensor_tree import At, Node, TensorTree
 from mrtamp.transitions.candidate import Candidate
@@ -269,14 +269,16 @@ class Growth:
                 self.orbits.refute_entries(after)
             if step + 1 < len(group):
                 before, after = group[step], group[step + 1]
-                self.orbits.refute(before, after, *self._guilty(violation, before))
+                carriers = {a.object: r for r, a in before.mode.held.items()}
+                robots, obstacle = violation.guilty(carriers, self.roadmaps)
+                self.orbits.refute(before, after, robots or tuple(self.names[:1]), obstacle)
 
-    def _guilty(self, violation: Violation, node: Node) -> tuple[tuple[str, ...], str | None]:
-        """The one or two robots that a violation is about, counting loads with their carriers, and what one hit."""
-        carriers = {a.object: r for r, a in node.mode.held.items()}
-        owners = [carriers.get(s.owner, s.owner) for s in violation.sides or ()]
-        robots = tuple(dict.fromkeys(o for o in owners if o in self.roadmaps))
-        obstacles = [o for o in owners if o not in self.roadmaps]
-        if robots and violation.kind == "collision":
-            return robots, obstacles[0] if obstacles else robots[0]
-        return robots or tuple(self.names[:1]), None
+    def refuted(self, report: Report, schedule: SpaceTime) -> bool:
+        """Learn which moves of a schedule the judge objects to; whether the same schedule will not be found again."""
+        learnt, alone = schedule.forbid(report)
+        for blamed in alone:
+            edge = self.insertion.edge_of(blamed.robot, blamed.move)
+            if edge is not None:
+                self.orbits.refute_edge(blamed.mode, blamed.robot, edge, blamed.obstacle)
+                learnt = True
+        return learnt

@@ -18,7 +18,7 @@ from mrtamp.modes import Mode
 from mrtamp.plan import Segment, Transition
 from mrtamp.roadmap import Roadmap
 from mrtamp.roadmap_rows import RoadmapRows
-from mrtamp.space_time import STEP, Leg, SpaceTime
+from mrtamp.space_time import STEP, Leg, Move, SpaceTime
 from mrtamp.steering import Steering
 from mrtamp.transitions.candidate import Candidate
 from mrtamp.validity import Validity
@@ -196,6 +196,10 @@ class Insertion:
                     if done is not None:
                         return done
         return None
+
+    def edge_of(self, robot: str, move: Move) -> tuple[int, int] | None:
+        """The roadmap edge (from, to) that a move of a robot is a part of, as long as it is remembered."""
+        return self._rows.edge_of(robot, move.a, move.b)
 
     @staticmethod
     def _ready(state: _State, robots: Sequence[Sequence[str]], before: Sequence[Sequence[int]]) -> list[int]:

@@ -9,6 +9,7 @@ MECHANISMS = {
     "orbit-path-guidance": "after the first plan, half of the search works along the incumbent's orbits",
     "skeletons": "guidance that knows costs: whole skeletons from decoupled distances",
     "way-descent": "sampled ways are shortened along their strata before skeletons choose among them",
+    "shorter-paths": "where a roadmap's path goes a long way round, trees look for one on another side",
     "lazy-validation": "roadmap edges are validated when a search asks; without it, all of them when they are made",
     "factored-cache": "what is known of an edge in one mode counts in others; without it every mode asks again",
     "rewiring": "after the first plan the tree is rewired to tensor neighbours, inside orbits and across transitions",

@@ -29,7 +29,7 @@ from mrtamp.optimise.descent import Descent
 from mrtamp.orbit_guidance import OrbitGuidance
 from mrtamp.orbit_sampling import OrbitSampling
 from mrtamp.plan import Plan, Transition
-from mrtamp.portfolio import Portfolio
+from mrtamp.portfolio import POOR, Portfolio
 from mrtamp.problem import MrtampError, Problem
 from mrtamp.realisation import Realisation
 from mrtamp.roadmap import roadmaps_of
@@ -43,6 +43,8 @@ _SKELETON_TURN = 4
 """Before the first plan, every so many iterations skeletons have their turn."""
 _AHEAD = 1.0
 """Work (s, or iterations where these bound a run) that skeletons may have had beyond search's before the first plan."""
+_CLEARLY = 0.02
+"""Relative gain that makes it another plan."""
 _WORTH_ADOPTING = 0.01
 """Relative gain over what the tree has for which a refined plan is put into it."""
 _RAREST = 5
@@ -111,6 +113,7 @@ class Planner:
             roadmap.inserted = None if self._uses("lazy-validation") else self.validity.insert
         self.sampler = TransitionSampler(problem, self.collision, self.roadmaps, self.validity, self.rng)
         self.growth = Growth(problem, self.roadmaps, self.validity, self.rng, self.options.intra_orbit, self.deadline)
+        self.growth.steering.shorter = self._uses("shorter-paths")
         self.graphs, self.tree = self.growth.graphs, self.growth.tree
         self.guidance = ModalGuidance(problem, self.sampler, self.graphs)
         self.orbit_guidance = OrbitGuidance(
@@ -136,6 +139,7 @@ class Planner:
         self.iteration = 0
         self._tree_cost = np.inf
         self._stale = self._skeletons_from = 0
+        self._challenged = np.inf
         self.incumbent = Incumbent(problem, seed, self._counts)
         self.incumbent.check_start()
         mode = start_mode(problem)
@@ -264,7 +268,7 @@ class Planner:
             # Others would only be other motions of the same ways: they wait until those there are have converged.
             skeletons = skeletons and not self._one_at_a_time()
             busy = busy or self.portfolio.nearing(to_beat)
-        elif skeletons and refine and self.realisation.undrafted:
+        elif skeletons and refine and (self.realisation.undrafted or self._poor(to_beat)):
             return "skeletons"
         available = [
             "search",
@@ -272,6 +276,18 @@ class Planner:
             *(["refinement"] if refine else []),
         ]
         return self._effort.next(available, eager="refinement" if busy else None)
+
+    def _poor(self, to_beat: float) -> bool:
+        """Whether a plan has just converged far above what skeletons promise: once per plan, others come first."""
+        bound = self.skeletons.bound or np.inf
+        if (
+            to_beat < POOR * bound
+            or to_beat > (1 - _CLEARLY) * self._challenged
+            or not self.portfolio.converged(to_beat)
+        ):
+            return False
+        self._challenged = to_beat
+        return True
 
     def _one_at_a_time(self) -> bool:
         """Whether other motions of the same ways wait for those under refinement to converge."""
@@ -365,6 +381,7 @@ class Planner:
         # Skeletons that only lead to known plans are asked for ever more rarely.
         self._stale = 0 if new else min(self._stale + 1, _RAREST)
         self._skeletons_from = self.iteration + 2**self._stale
+        self.growth.steering.thorough = True
         if self._uses("rewiring"):
             self.growth.orbits.rewirings = _REWIRINGS
         return new
@@ -423,6 +440,7 @@ class Planner:
 
     def _refine(self) -> None:
         """Give refinement its turn."""
+        self.portfolio.bound = self.skeletons.bound or 0.0
         plan = self.portfolio.improve(self._to_beat())
         if plan is not None:
             self._offer(plan)

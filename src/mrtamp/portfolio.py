@@ -55,6 +55,8 @@ _PLENTY, _PATIENCE, _LONGER = 0.01, 4, 24
 """Relative gain that is checked at once, and programs after which a smaller one is: more of them where they are small
 ones of local search."""
 
+POOR = 1.12
+"""How many times as much as skeletons promise a converged plan costs that others had better challenge."""
 _ROUNDS = 6
 """Rounds without gain after which a plan is left alone."""
 _FIRST_SEARCH = 2
@@ -244,6 +246,8 @@ class Portfolio:
         self._seen: set[float] = set()
         self._took: deque[float] = deque(maxlen=_RECENT)
         """Seconds that the last programs took."""
+        self.bound = 0.0
+        """What the cheapest skeleton promises to cost, 0 where that is not known."""
         self._contest: str | None = None
         """Which of the two had its turn last, where there was a choice."""
         self._share = 0.0
@@ -387,6 +391,14 @@ class Portfolio:
             for e in self._entries
         )
 
+    def converged(self, incumbent: float) -> bool:
+        """Whether the first round of the plan that is the incumbent is over."""
+        return any(e.rounds >= 1 and e.cost <= incumbent + _EPS for e in self._entries)
+
+    def _poor(self, entry: _Entry) -> bool:
+        """Whether other ways would gain more than a finer round can; where there are none, there is nothing better."""
+        return entry.rounds > 0 and not self.patience.same_ways and entry.cost > POOR * self.bound > 0
+
     def _hopeful(self, entry: _Entry, incumbent: float) -> bool:
         """Whether a plan may still beat the incumbent; later rounds take off all plans about the same."""
         best = max(incumbent, self._coarse) if entry.rounds <= 1 else incumbent
@@ -410,8 +422,9 @@ class Portfolio:
         return entry.done and entry.fruitless < _ROUNDS and self._hopeful(entry, incumbent)
 
     def _choose(self, incumbent: float) -> _Entry | None:
-        """One that is about to beat the incumbent; else the incumbent itself if it `goes_ahead`; else, as the shares of
-        both have it, one in its first round, the newest first, or one in a later round.
+        """One that is about to beat the incumbent; else the incumbent itself if it `goes_ahead`, unless it is poor for
+        what skeletons promise; else, as the shares of both have it, one in its first round, the newest first, or one in
+        a later round.
 
         What drafts seem to cost before their first program says nothing: those on trial begin with the most promising.
         Drafts that are hopeless are given up.
@@ -424,7 +437,9 @@ class Portfolio:
         near = [e for e in self._entries if e.is_near(incumbent)]
         if near:
             return min(near, key=lambda e: e.outlook)
-        ahead = next((e for e in self._entries if e.goes_ahead and e.cost <= incumbent + _EPS), None)
+        ahead = next(
+            (e for e in self._entries if e.goes_ahead and e.cost <= incumbent + _EPS and not self._poor(e)), None
+        )
         if ahead is not None:
             return self._again(ahead) if ahead.done else ahead
         hopeful = [e for e in self._entries if not e.done and self._hopeful(e, incumbent)]

@@ -168,7 +168,7 @@ class Realisation:
             if report.ok:
                 return plan
             # Something slipped between the samples.
-            if not schedule.forbid(report):
+            if not self.growth.refuted(report, schedule):
                 return None
             timed = self.growth.insert(proposal, self.skeletons, self.root)
             schedule = self.growth.insertion.schedule

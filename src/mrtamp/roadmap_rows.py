@@ -76,3 +76,19 @@ class RoadmapRows:
             inner = [self.clearances.row(robot, q[a] + (q[b] - q[a]) * (j / n)) for j in range(1, n)]
             self._edges[robot, a, b] = [*inner, self.vertex(robot, b)]
         return self._edges[robot, a, b]
+
+    def edge_of(self, robot: str, row: int, after: int) -> tuple[int, int] | None:
+        """The edge (from, to) on which one row comes after another, or the vertex (twice) that both are at; or None.
+
+        Looks at all that is known: for use where the judge objected to a move, which is rare.
+        """
+        q, table = self.roadmaps[robot].q, self.clearances.tables[robot]
+        if row == after:
+            return next(((v, v) for (r, v), i in self._vertices.items() if r == robot and i == row), None)
+        for (r, a, b), rows in self._edges.items():
+            if r == robot and after in rows:
+                k = rows.index(after)
+                # The first row of a path need not be the vertex's own.
+                if rows[k - 1] == row if k else np.array_equal(table[row], q[a]):
+                    return a, b
+        return None

@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mrtamp.check_report import Report
-from mrtamp.collision import RESOLUTION, Collision, bisection_order, load_poses
+from mrtamp.bounding import Balls
+from mrtamp.check_report import Report, Violation
+from mrtamp.collision import RESOLUTION, Collision, Posed, bisection_order
 from mrtamp.modes import Attachment, Mode
 from mrtamp.plan import Segment
 from mrtamp.validity import Validity
@@ -57,13 +58,22 @@ class Move:
     mode: Mode
 
 
+class Blamed(NamedTuple):
+    """A move with which a robot, with its load, hits `obstacle` in `mode`: an object at rest, the world or itself."""
+
+    robot: str
+    move: Move
+    mode: Mode
+    obstacle: str
+
+
 class _Sampled(NamedTuple):
-    """Centres (3, B, 3) of the bodies' spheres and the grasp frame G at both ends and the middle of a move.
+    """Centres (3, K, 3) of the beads and the grasp frame G at both ends and the middle of a move.
 
     No tracked point's way is longer than `travel` (m).
     """
 
-    centres: np.ndarray
+    beads: np.ndarray
     R_WG: np.ndarray
     p_WG: np.ndarray
     travel: float
@@ -88,8 +98,8 @@ class Clearances:
         self._pairs: dict[tuple, bool] = {}
         self._objects: dict[tuple, bool] = {}
         self._sampled: dict[tuple[str, int, int], _Sampled] = {}
-        self._samples: dict[tuple, tuple[np.ndarray, np.ndarray | None]] = {}
-        self._balls: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
+        self._samples: dict[tuple, tuple[np.ndarray, Posed]] = {}
+        self._balls: dict[tuple, Balls] = {}
 
     @property
     def size(self) -> int:
@@ -113,32 +123,36 @@ class Clearances:
             return
         q = np.array([[table[a], (table[a] + table[b]) / 2, table[b]] for a, b in fresh])
         flat = q.reshape(-1, q.shape[2])
-        centres, R_WG, p_WG = world.spheres_and_grasp(flat)
-        centres, R_WG, p_WG = centres.reshape(len(fresh), 3, -1, 3), R_WG.reshape(-1, 3, 3, 3), p_WG.reshape(-1, 3, 3)
-        tracked = np.concatenate([centres, p_WG[:, :, None]], axis=2)
+        Rs, ps, _ = world.chain.sweep(flat)
+        beads, spheres = (x.placed(Rs, ps).reshape(len(fresh), 3, -1, 3) for x in (world.beads, world.bounds))
+        R_WG, p_WG = (x.reshape(len(fresh), 3, *x.shape[1:]) for x in world.tool.carried(Rs, ps))
+        # Many are kept: single precision will do.
+        beads = beads.astype(np.float32)
+        tracked = np.concatenate([spheres, p_WG[:, :, None]], axis=2)
         # Points move neither evenly nor straight: twice the faster half, and a tenth more.
         travel = 2.2 * np.linalg.norm(np.diff(tracked, axis=1), axis=3).max(axis=(1, 2))
         for k, (a, b) in enumerate(fresh):
-            self._sampled[robot, a, b] = _Sampled(centres[k], R_WG[k], p_WG[k], float(travel[k]))
+            self._sampled[robot, a, b] = _Sampled(beads[k], R_WG[k], p_WG[k], float(travel[k]))
 
     def _sample(self, robot: str, a: int, b: int) -> _Sampled:
         if (robot, a, b) not in self._sampled:
             self.prepare(robot, [(a, b)])
         return self._sampled[robot, a, b]
 
-    def _ball(self, robot: str, a: int, b: int, held: Attachment | None) -> tuple[np.ndarray, np.ndarray]:
-        """Balls (B, 3), (B,) that hold every body, and the load, all through a move."""
+    def _ball(self, robot: str, a: int, b: int, held: Attachment | None) -> Balls:
+        """Balls (K,) that hold every bead, and the load, all through a move."""
         key = (robot, a, b, held)
         if key not in self._balls:
             world = self.worlds[robot]
             centres, R_WG, p_WG, _ = self._sample(robot, a, b)
-            radii = world.bounds.radii
+            radii = world.beads.radii
             if held is not None:
                 # What a hand holds has the grasp frame G for its parent P.
-                centres = np.concatenate([centres, (p_WG + R_WG @ held.X_PO[:3, 3])[:, None]], axis=1)
+                load = (p_WG + R_WG @ held.X_PO[:3, 3]).astype(np.float32)
+                centres = np.concatenate([centres, load[:, None]], axis=1)
                 radii = np.append(radii, world.object_radius[held.object])
             middle = (centres.min(axis=0) + centres.max(axis=0)) / 2
-            self._balls[key] = (middle, radii + np.linalg.norm(centres - middle, axis=2).max(axis=0))
+            self._balls[key] = Balls(middle, radii + np.linalg.norm(centres - middle, axis=2).max(axis=0))
         return self._balls[key]
 
     def _density(self, robots: Sequence[tuple[str, Move]]) -> int:
@@ -164,26 +178,23 @@ class Clearances:
     def _apart(
         self, one: str, a: Move, held_a: Attachment | None, two: str, b: Move, held_b: Attachment | None
     ) -> bool:
-        ca, ra = self._ball(one, a.a, a.b, held_a)
-        cb, rb = self._ball(two, b.a, b.b, held_b)
-        gap = np.linalg.norm(ca[:, None] - cb[None], axis=2) - ra[:, None] - rb[None]
-        if gap.min() > _NEAR:
+        if not self._ball(one, a.a, a.b, held_a).near(self._ball(two, b.a, b.b, held_b), _NEAR):
             return True
         n = self._density([(one, a), (two, b)]) if (a.a, b.a) != (a.b, b.b) else 1
-        qa, load_a = self._along(one, a, held_a, n)
-        qb, load_b = self._along(two, b, held_b, n)
+        qa, posed_a = self._along(one, a, held_a, n)
+        qb, posed_b = self._along(two, b, held_b, n)
         ends = np.arange(n)[bisection_order(n)] % max(n - 1, 1) == 0
-        hit = self.collision.first_hit(one, qa, held_a, two, qb, held_b, exact=ends, loads=(load_a, load_b))
+        hit = self.collision.first_hit(one, qa, held_a, two, qb, held_b, exact=ends, posed=(posed_a, posed_b))
         return hit < 0
 
-    def _along(self, robot: str, move: Move, held: Attachment | None, n: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Samples (n, dof) of a move in bisection order, and the poses of the load there."""
+    def _along(self, robot: str, move: Move, held: Attachment | None, n: int) -> tuple[np.ndarray, Posed]:
+        """Samples (n, dof) of a move in bisection order, and the robot there."""
         key = (robot, move.a, move.b, held, n)
         known = self._samples.get(key)
         if known is None:
             t = np.linspace(0, 1, n)[bisection_order(n)][:, None]
             q = (1 - t) * self.tables[robot][move.a] + t * self.tables[robot][move.b]
-            known = (q, None if held is None else load_poses(self.worlds[robot].tool, q, held))
+            known = (q, self.worlds[robot].posed(q, held))
             self._samples[key] = known
         return known
 
@@ -206,9 +217,9 @@ class Clearances:
         key = (robot, move.a, move.b, held, chain)
         known = self._objects.get(key)
         if known is None:
-            centres, radii = self._ball(robot, move.a, move.b, held)
+            balls = self._ball(robot, move.a, move.b, held)
             world = self.worlds[robot]
-            gap = np.linalg.norm(centres - X_WO[:3, 3], axis=1) - radii - world.object_radius[item]
+            gap = np.linalg.norm(balls.centres - X_WO[:3, 3], axis=1) - balls.radii - world.object_radius[item]
             known = bool(gap.min() > _NEAR)
             if not known:
                 n = self._density([(robot, move)]) if move.a != move.b else 1
@@ -420,20 +431,42 @@ class SpaceTime:
         finally:
             self.events.pop()
 
-    def forbid(self, report: Report) -> bool:
-        """Learn where the judge found two robots in each other's way; whether there was such a step."""
+    def forbid(self, report: Report) -> tuple[bool, list[Blamed]]:
+        """Learn where the judge found robots in each other's way, or in that of things that lie about.
+
+        Returns
+        -------
+        Whether moves will be seen otherwise from now on, and the moves that were bad whatever the other robots did.
+        Where collisions of several robots with the world are reported of one step, it may be their sum that is not
+        tolerated: then they do not happen at the same time again.
+        """
         bounds = [0, *self.events]
-        learnt = False
+        steps: dict[int, list[Violation]] = {}
         for v in report.violations:
-            if v.kind != "collision" or v.segment is None or v.step is None:
-                continue
-            t = bounds[v.segment] + v.step
-            holders = {a.object: r for r in self.names if (a := self._holds(r, t)) is not None}
-            robots = {holders.get(s.owner, s.owner) for s in v.sides or ()} & set(self.names)
-            if len(robots) == 2:
-                self.clearances.forbid({r: (self._move(r, t), self._holds(r, t)) for r in robots})
+            if v.kind == "collision" and v.segment is not None and v.step is not None:
+                steps.setdefault(bounds[v.segment] + v.step, []).append(v)
+        learnt, alone = False, list[Blamed]()
+        for t, violations in steps.items():
+            mode = self._mode(t)
+            held = {r: self._holds(r, t) for r in self.names}
+            carriers = {a.object: r for r, a in held.items() if a is not None}
+            found = [v.guilty(carriers, self.names) for v in violations]
+            pairs = {robots for robots, _ in found if len(robots) == 2}
+            depths: dict[str, float] = {}
+            for v, (robots, _) in zip(violations, found, strict=True):
+                if len(robots) == 1:
+                    depths[robots[0]] = depths.get(robots[0], 0.0) + (v.value or 0.0)
+            if len(depths) > 1:
+                one, two, *_ = sorted(depths, key=lambda r: -depths[r])
+                pairs.add((one, two))
+            for pair in pairs:
+                self.clearances.forbid({r: (self._move(r, t), held[r]) for r in pair})
                 learnt = True
-        return learnt
+            if not pairs:
+                for robots, obstacle in found:
+                    if robots and obstacle is not None:
+                        alone.append(Blamed(robots[0], self._move(robots[0], t), mode, obstacle))
+        return learnt, alone
 
     def segments(self) -> list[Segment]:
         """The schedule as segments, one per mode."""

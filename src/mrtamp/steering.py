@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 
 import numpy as np
 
@@ -29,6 +29,11 @@ _ASIDE_ROUNDS = 8
 
 _SEARCHES, _TREE = 4, 40
 """How often a way that the roadmap lacks is looked for between two vertices, and tree extensions, doubled each time."""
+_LONG, _THOROUGH, _FAR_ROUND = 2.2, 1.4, 1.5
+"""How many times as long as the straight line a path has to be, and how much longer (rad or m), for a shorter one to be
+looked for: before there is a plan, and later."""
+_SHORTER = 0.8
+"""How long another has to be at most, relative to that, to be worth it."""
 _DETOUR = 1.0
 """How much longer than the shortest path one past a random vertex may be, relative to it."""
 Insert = Callable[[Node, At], Node]
@@ -38,6 +43,11 @@ class Steering:
     """Extends the tree towards roadmap vertices; every step it takes has been validated.
 
     Its searches raise `TimeIsUp` when the deadline has passed.
+
+    Attributes
+    ----------
+    shorter : whether paths that go a long way round are looked at for a shorter one.
+    thorough : whether that is worth more than one try, for paths that are not quite as long, too: once there is a plan.
     """
 
     def __init__(
@@ -56,6 +66,7 @@ class Steering:
         self.index = {g.name: i for i, g in enumerate(roadmaps)}
         self.trouble: Counter[tuple[str, str]] = Counter()
         self.connector = Connector(validity, rng, self.deadline)
+        self.shorter, self.thorough = True, False
         self._sought: Counter[tuple] = Counter()
 
     def drive(self, node: Node, targets: Mapping[str, int], depth: int = 1) -> Node | None:
@@ -177,7 +188,10 @@ class Steering:
             wanted = seek or (connect and not blockers)
             return self._joined(roadmap, mode, start, goal, others) if wanted else None
 
-        return self.connector.path(roadmap, start, goal, blocked, validate, rounds, join, glance), blockers
+        path = self.connector.path(roadmap, start, goal, blocked, validate, rounds, join, glance)
+        if path is not None and self.shorter and connect and not blockers:
+            path = self._shorter(roadmap, mode, path, validate)
+        return path, blockers
 
     def _past(
         self,
@@ -206,11 +220,35 @@ class Steering:
     ) -> list[int] | None:
         """The roadmap has no way: look for one, harder each time, and ever more rarely where that is in vain."""
         key = (roadmap.name, mode.key, start, goal, *(x.tobytes() for x in standing.values()))
-        self._sought[key] += 1
-        tries = self._sought[key]
-        if tries > _SEARCHES and tries & (tries - 1):
+        tries = self._worth_seeking(*key)
+        if not tries:
             return None
         return self.connector.connect(roadmap, mode, start, goal, _TREE << min(tries, _SEARCHES), standing)
+
+    def _shorter(self, roadmap: Roadmap, mode: Mode, path: list[int], validate: Callable[[int], bool]) -> list[int]:
+        """A path that goes a long way round, or a shorter one on the other side of what is in the way.
+
+        Refinement never leaves the homotopy class of a path, and a sparse roadmap may know a poor one only.
+        """
+        start, goal = path[0], path[-1]
+        length, direct = _length(roadmap, path), _length(roadmap, [start, goal])
+        if length < max((_THOROUGH if self.thorough else _LONG) * direct, direct + _FAR_ROUND):
+            return path
+        tries = self._worth_seeking("shorter", roadmap.name, mode.key, start, goal)
+        if tries > 1 and not self.thorough:
+            return path
+        longest = _SHORTER * length
+        effort = _TREE << min(tries, _SEARCHES) >> 1
+        found = self.connector.connect(roadmap, mode, start, goal, effort, longest=longest) if tries else None
+        if found is None or _length(roadmap, found) > longest:
+            return path
+        return found if all(validate(roadmap.edge(u, v)) for u, v in itertools.pairwise(found)) else path
+
+    def _worth_seeking(self, *key: Hashable) -> int:
+        """The number of this try to find something, 0 where it is put off: ever more are, where tries are in vain."""
+        self._sought[key] += 1
+        tries = self._sought[key]
+        return 0 if tries > _SEARCHES and tries & (tries - 1) else tries
 
     def _follow(self, node: Node, robot: str, path: list[int]) -> Node:
         i = self.index[robot]
@@ -234,3 +272,8 @@ class Steering:
     def step_is_valid(self, mode: Mode, a: At, b: At) -> bool:
         """LazyValidate one synchronous step."""
         return step_is_valid(self.roadmaps, self.validity, mode, a, b)
+
+
+def _length(roadmap: Roadmap, path: list[int]) -> float:
+    """Joint distance along vertices."""
+    return float(np.linalg.norm(np.diff(roadmap.q[path], axis=0), axis=1).sum())

@@ -16,8 +16,8 @@ from arena import Parts, arena, visit, wall
 import mrtamp
 from mrtamp.baselines.composed_prm import ComposedOptions, ComposedPRM
 from mrtamp.baselines.composite import CompositeRoadmap, Layer
-from mrtamp.baselines.informed import ellipsoid_samples
 from mrtamp.baselines.multimodal import Multimodal
+from mrtamp.informed import ellipsoid_sample
 from mrtamp.modes import Mode
 from mrtamp.plan import Segment, segment_cost
 from mrtamp.planar import shortest_path, visibility_graph
@@ -136,7 +136,7 @@ def test_informed_samples_fill_the_ellipsoid(n: int) -> None:
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, n))
     gap = float(np.linalg.norm(b - a))
-    x = np.array([ellipsoid_samples(a, b, 1.5 * gap, rng) for _ in range(3000)])
+    x = np.array([ellipsoid_sample(a, b, 1.5 * gap, rng) for _ in range(3000)])
     through = np.linalg.norm(x - a, axis=1) + np.linalg.norm(x - b, axis=1)
     assert through.max() <= 1.5 * gap + 1e-9
     assert through.max() > 1.45 * gap

@@ -108,7 +108,11 @@ def refute(setting: Setting, rng: np.random.Generator) -> None:
         x, y = pairs[int(rng.integers(len(pairs)))]
         moving = [g.name for g, u, v in zip(setting.roadmaps, x.at, y.at, strict=True) if u != v]
         alone = rng.random() < 0.3
-        setting.orbits.refute(x, y, (moving[0],) if alone else ("a", "b"), "wall" if alone else None)
+        if alone and rng.random() < 0.5:
+            i = [g.name for g in setting.roadmaps].index(moving[0])
+            setting.orbits.refute_edge(x.mode, moving[0], (x.at[i], y.at[i]), "wall")
+        else:
+            setting.orbits.refute(x, y, (moving[0],) if alone else ("a", "b"), "wall" if alone else None)
         assert y not in x.steps
         assert not step_is_valid(setting.roadmaps, setting.world, x.mode, x.at, y.at)
 

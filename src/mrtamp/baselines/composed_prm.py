@@ -15,9 +15,9 @@ import numpy as np
 
 from mrtamp.baselines.anytime import Anytime
 from mrtamp.baselines.composite import CompositeRoadmap, Layer
-from mrtamp.baselines.informed import ellipsoid_samples
 from mrtamp.baselines.multimodal import Crossing, Found, Multimodal
 from mrtamp.guidance import Choice
+from mrtamp.informed import ellipsoid_sample
 from mrtamp.mechanisms import check_without
 from mrtamp.modes import goal_mode
 from mrtamp.plan import Plan, Segment, Transition
@@ -172,7 +172,7 @@ class ComposedPRM(Anytime):
         for _ in range(_ROUNDS):
             x = np.concatenate(
                 [
-                    ellipsoid_samples(a, b, longest / scale, self.rng)
+                    ellipsoid_sample(a, b, longest / scale, self.rng)
                     for a, b in zip(self.roadmap.parts(q[i]), self.roadmap.parts(q[j]), strict=True)
                 ]
             )

@@ -7,7 +7,7 @@ mode, and a step that the judge refutes may break one into several.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from mrtamp.graphs import Graphs
 from mrtamp.intra_orbit.lazy_validate import step_is_valid
@@ -119,20 +119,30 @@ class Orbits:
         `guilty` and `obstacle` are as for `Validity.forbid`: the one or two robots it is about, and what one hits.
         """
         one, two = as_mapping(self.roadmaps, before.at), as_mapping(self.roadmaps, after.at)
-        self.validity.forbid(before.mode, one, two, guilty, obstacle)
-        self.validity.forbid(before.mode, two, one, guilty, obstacle)
-        edges = [(i, {before.at[i], after.at[i]}) for i, g in enumerate(self.roadmaps) if g.name in guilty]
         wrong = [(before, after)] if after in before.steps else []
-        for x in self.tree.nodes:
-            for y in x.steps:
-                if (
-                    x.index < y.index
-                    and {x, y} != {before, after}
-                    and all({x.at[i], y.at[i]} == edge for i, edge in edges)
-                    and not step_is_valid(self.roadmaps, self.validity, x.mode, x.at, y.at)
-                ):
-                    wrong.append((x, y))
-        self._withdraw(wrong)
+        others = self._forbid(before.mode, {r: (one[r], two[r]) for r in guilty}, obstacle)
+        self._withdraw([*wrong, *(pair for pair in others if set(pair) != {before, after})])
+
+    def refute_edge(self, mode: Mode, robot: str, edge: tuple[int, int], obstacle: str) -> None:
+        """A robot's edge (from, to) hits `obstacle` in `mode` after all: forbid it, withdraw what rests on it."""
+        self._withdraw(self._forbid(mode, {robot: edge}, obstacle))
+
+    def _forbid(
+        self, mode: Mode, edges: Mapping[str, tuple[int, int]], obstacle: str | None
+    ) -> list[tuple[Node, Node]]:
+        """Forbid edges of one or two robots in both directions; the steps of the tree that are invalid for it."""
+        one, two = ({r: e[k] for r, e in edges.items()} for k in (0, 1))
+        self.validity.forbid(mode, one, two, tuple(edges), obstacle)
+        self.validity.forbid(mode, two, one, tuple(edges), obstacle)
+        taken = [(i, set(edges[g.name])) for i, g in enumerate(self.roadmaps) if g.name in edges]
+        return [
+            (x, y)
+            for x in self.tree.nodes
+            for y in x.steps
+            if x.index < y.index
+            and all({x.at[i], y.at[i]} == edge for i, edge in taken)
+            and not step_is_valid(self.roadmaps, self.validity, x.mode, x.at, y.at)
+        ]
 
     def refute_entries(self, node: Node) -> None:
         """The change of mode that leads to `node` is invalid at its vertices: withdraw every transition to it."""

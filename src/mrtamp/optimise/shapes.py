@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from pydrake.geometry import Box, Capsule, Cylinder, GeometryId, HalfSpace, SceneGraphInspector, Sphere
 
-from mrtamp.collision import geometry_bound
+from mrtamp.bounding import geometry_bound
 from mrtamp.optimise.rounded import Solids, beyond, signed_distances
 from mrtamp.scene import Scene, geometry_ids, robot_bodies
 

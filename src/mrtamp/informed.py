@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def ellipsoid_samples(a: np.ndarray, b: np.ndarray, longest: float, rng: np.random.Generator) -> np.ndarray:
+def ellipsoid_sample(a: np.ndarray, b: np.ndarray, longest: float, rng: np.random.Generator) -> np.ndarray:
     """A point x (n,), uniform among those with |x - a| + |b - x| <= `longest` (Gammell et al., 2014).
 
     Where no point but those between a and b satisfies that, one of these.
