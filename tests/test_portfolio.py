@@ -94,19 +94,19 @@ def test_an_incumbent_far_above_what_skeletons_promise_is_challenged_before_its_
 
     def poor(times: float) -> bool:
         """As if skeletons promised that the incumbent costs so many times as much as it could."""
-        planner.skeletons.bound = portfolio.bound = best.cost / times
+        planner.skeletons.bound = best.cost / times
         return planner._poor(best.cost)
 
     assert not poor(1.2), "its first round is not over"
     while not entry.done:
         best = portfolio.improve(best.cost) or best
     assert portfolio.add(roundabout(planner, -0.9))
-    assert not poor(1.1) and portfolio._choose(best.cost) is entry
-    assert poor(1.2) and portfolio._choose(best.cost) is not entry
+    assert not poor(1.1) and portfolio._choose(best.cost, planner.skeletons.bound) is entry
+    assert poor(1.2) and portfolio._choose(best.cost, planner.skeletons.bound) is not entry
     assert not poor(1.2), "skeletons had their turn"
     portfolio.suit(choice=False)
     entry.patience = portfolio.patience
-    assert portfolio._choose(best.cost) is entry, "there are no other ways"
+    assert portfolio._choose(best.cost, planner.skeletons.bound) is entry, "there are no other ways"
 
 
 def test_drafts_begin_with_the_most_promising_whatever_they_seem_to_cost(tmp_path: Path) -> None:
@@ -290,8 +290,10 @@ def test_what_has_converged_goes_on_beside_what_is_new(tmp_path: Path, monkeypat
         worked: list[_Entry] = []
         choose = Portfolio._choose
 
-        def chosen(self: Portfolio, incumbent: float, choose=choose, worked=worked) -> _Entry | None:
-            worked.append(choose(self, incumbent))
+        def chosen(
+            self: Portfolio, incumbent: float, bound: float | None, choose=choose, worked=worked
+        ) -> _Entry | None:
+            worked.append(choose(self, incumbent, bound))
             return worked[-1]
 
         with monkeypatch.context() as patch:

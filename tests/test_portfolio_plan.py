@@ -108,9 +108,9 @@ def test_nothing_is_tried_that_cannot_beat_the_bound(tmp_path: Path, monkeypatch
             counts["skeletons"] += 1
             return insert(*arguments, **how)
 
-        def counted_improve(to_beat: float) -> Plan | None:
+        def counted_improve(to_beat: float, promised: float | None) -> Plan | None:
             assert to_beat <= bound
-            plan = improve(to_beat)
+            plan = improve(to_beat, promised)
             counts["refined"] += plan is not None
             assert plan is None or plan.cost < bound
             return plan

@@ -29,7 +29,7 @@ from mrtamp.optimise.descent import Descent
 from mrtamp.orbit_guidance import OrbitGuidance
 from mrtamp.orbit_sampling import OrbitSampling
 from mrtamp.plan import Plan, Transition
-from mrtamp.portfolio import POOR, Portfolio
+from mrtamp.portfolio import Portfolio
 from mrtamp.problem import MrtampError, Problem
 from mrtamp.realisation import Realisation
 from mrtamp.roadmap import roadmaps_of
@@ -279,12 +279,7 @@ class Planner:
 
     def _poor(self, to_beat: float) -> bool:
         """Whether a plan has just converged far above what skeletons promise: once per plan, others come first."""
-        bound = self.skeletons.bound or np.inf
-        if (
-            to_beat < POOR * bound
-            or to_beat > (1 - _CLEARLY) * self._challenged
-            or not self.portfolio.converged(to_beat)
-        ):
+        if to_beat > (1 - _CLEARLY) * self._challenged or not self.portfolio.poor(to_beat, self.skeletons.bound):
             return False
         self._challenged = to_beat
         return True
@@ -440,8 +435,7 @@ class Planner:
 
     def _refine(self) -> None:
         """Give refinement its turn."""
-        self.portfolio.bound = self.skeletons.bound or 0.0
-        plan = self.portfolio.improve(self._to_beat())
+        plan = self.portfolio.improve(self._to_beat(), self.skeletons.bound)
         if plan is not None:
             self._offer(plan)
         for settled in self.portfolio.settled() if self._uses("adoption") else []:

@@ -55,7 +55,7 @@ _PLENTY, _PATIENCE, _LONGER = 0.01, 4, 24
 """Relative gain that is checked at once, and programs after which a smaller one is: more of them where they are small
 ones of local search."""
 
-POOR = 1.12
+_POOR = 1.12
 """How many times as much as skeletons promise a converged plan costs that others had better challenge."""
 _ROUNDS = 6
 """Rounds without gain after which a plan is left alone."""
@@ -246,8 +246,6 @@ class Portfolio:
         self._seen: set[float] = set()
         self._took: deque[float] = deque(maxlen=_RECENT)
         """Seconds that the last programs took."""
-        self.bound = 0.0
-        """What the cheapest skeleton promises to cost, 0 where that is not known."""
         self._contest: str | None = None
         """Which of the two had its turn last, where there was a choice."""
         self._share = 0.0
@@ -337,9 +335,9 @@ class Portfolio:
             going = [e for e in others if e.done] or [e for e in others if not e.draft] or others
             self._entries.remove(max(going, key=lambda e: e.cost))
 
-    def improve(self, incumbent: float) -> Plan | None:
-        """Give one plan its turn; a checked plan when it is clearly cheaper than `incumbent`."""
-        entry = self._choose(incumbent)
+    def improve(self, incumbent: float, bound: float | None = None) -> Plan | None:
+        """Give one plan its turn; a checked plan when it is clearly cheaper than `incumbent`; `bound` as in `poor`."""
+        entry = self._choose(incumbent, bound)
         self.drafted = entry is not None and entry.fresh_draft
         if entry is None:
             return None
@@ -391,13 +389,16 @@ class Portfolio:
             for e in self._entries
         )
 
-    def converged(self, incumbent: float) -> bool:
-        """Whether the first round of the plan that is the incumbent is over."""
-        return any(e.rounds >= 1 and e.cost <= incumbent + _EPS for e in self._entries)
+    def poor(self, incumbent: float, bound: float | None) -> bool:
+        """Whether the first round of the incumbent is over, and other ways would gain more than a finer one can.
 
-    def _poor(self, entry: _Entry) -> bool:
-        """Whether other ways would gain more than a finer round can; where there are none, there is nothing better."""
-        return entry.rounds > 0 and not self.patience.same_ways and entry.cost > POOR * self.bound > 0
+        `bound` is what the cheapest skeleton promises; None where that is not known.
+        """
+        return any(e.cost <= incumbent + _EPS and self._poor(e, bound) for e in self._entries)
+
+    def _poor(self, entry: _Entry, bound: float | None) -> bool:
+        # Where there are no other ways, there is nothing better.
+        return entry.rounds > 0 and not self.patience.same_ways and entry.cost > _POOR * (bound or np.inf)
 
     def _hopeful(self, entry: _Entry, incumbent: float) -> bool:
         """Whether a plan may still beat the incumbent; later rounds take off all plans about the same."""
@@ -421,7 +422,7 @@ class Portfolio:
         """Whether a plan that has converged is shaken and refined again."""
         return entry.done and entry.fruitless < _ROUNDS and self._hopeful(entry, incumbent)
 
-    def _choose(self, incumbent: float) -> _Entry | None:
+    def _choose(self, incumbent: float, bound: float | None = None) -> _Entry | None:
         """One that is about to beat the incumbent; else the incumbent itself if it `goes_ahead`, unless it is poor for
         what skeletons promise; else, as the shares of both have it, one in its first round, the newest first, or one in
         a later round.
@@ -438,7 +439,7 @@ class Portfolio:
         if near:
             return min(near, key=lambda e: e.outlook)
         ahead = next(
-            (e for e in self._entries if e.goes_ahead and e.cost <= incumbent + _EPS and not self._poor(e)), None
+            (e for e in self._entries if e.goes_ahead and e.cost <= incumbent + _EPS and not self._poor(e, bound)), None
         )
         if ahead is not None:
             return self._again(ahead) if ahead.done else ahead
