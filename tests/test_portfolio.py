@@ -15,7 +15,8 @@ from mrtamp.check import check_plan
 from mrtamp.options import Skeleton
 from mrtamp.plan import Plan
 from mrtamp.planner import Options, Planner
-from mrtamp.portfolio import _PATIENCE, SIZE, Portfolio, _Entry
+from mrtamp.portfolio import _PATIENCE, SIZE, Portfolio
+from mrtamp.portfolio_entry import Entry
 from mrtamp.skeleton_guidance import Proposal
 
 STARTS: Mapping[str, XY] = {"a": (-1, 1), "b": (-1, -1)}
@@ -193,7 +194,7 @@ def test_a_first_round_is_expected_to_go_on_at_its_pace(tmp_path: Path) -> None:
     for choice in (True, False):
         portfolio.suit(choice=choice)
         for trail, kept in ((np.linspace(1.5, 1.2, 10), not choice), (np.linspace(1.21, 1.2, 10), False)):
-            entry = _Entry(plan, draft=True, patience=portfolio.patience)
+            entry = Entry(plan, draft=True, patience=portfolio.patience)
             entry.optimiser = portfolio._optimiser(entry)
             entry.trail = [x * plan.cost for x in trail]
             entry.optimiser.steps = 20
@@ -228,7 +229,7 @@ def test_ways_are_kept_of_plans_that_are_done_with(tmp_path: Path) -> None:
 
 def test_small_gains_wait_for_the_judge_until_several_programs_have_passed(tmp_path: Path) -> None:
     planner = planner_for(tmp_path)
-    entry = _Entry(roundabout(planner, 0.6))
+    entry = Entry(roundabout(planner, 0.6))
     gains = [0.1, 0.0, *(_PATIENCE + 2) * [0.005]]
     due = [planner.portfolio._due(entry, entry.cost * (1 + gain)) for gain in gains]
     assert due == [True, False, *_PATIENCE * [False], True, False]
@@ -286,13 +287,13 @@ def test_what_has_converged_goes_on_beside_what_is_new(tmp_path: Path, monkeypat
         if not any(e.fresh for e in portfolio._entries):
             portfolio._seen.clear()
             portfolio._entries = [entry]
-            portfolio._admit([_Entry(roundabout(planner, next(heights)))])
-        worked: list[_Entry] = []
+            portfolio._admit([Entry(roundabout(planner, next(heights)))])
+        worked: list[Entry] = []
         choose = Portfolio._choose
 
         def chosen(
             self: Portfolio, incumbent: float, bound: float | None, choose=choose, worked=worked
-        ) -> _Entry | None:
+        ) -> Entry | None:
             worked.append(choose(self, incumbent, bound))
             return worked[-1]
 
@@ -306,7 +307,7 @@ def test_what_has_converged_goes_on_beside_what_is_new(tmp_path: Path, monkeypat
 def test_what_was_gained_is_judged_before_time_is_up(tmp_path: Path) -> None:
     planner = planner_for(tmp_path)
     portfolio = planner.portfolio
-    entry = _Entry(roundabout(planner, 0.6))
+    entry = Entry(roundabout(planner, 0.6))
     portfolio.incumbent.judging_s = 1.0
     for left, took, due in ((None, 1.0, False), (60.0, 1.0, False), (2.4, 1.0, True), (2.4, 0.1, False)):
         portfolio.deadline.set(left)
@@ -327,7 +328,55 @@ def test_rounds_of_local_search_and_of_finer_programs_take_turns(
     portfolio = (planner := planner_for(tmp_path, "ab", *without)).portfolio
     portfolio.suit(choice=choice)
     plan = roundabout(planner, 0.6)
-    rounds = [_Entry(plan, rounds=k, patience=portfolio.patience) for k in range(7)]
+    rounds = [Entry(plan, rounds=k, patience=portfolio.patience) for k in range(7)]
     assert [e.rounds for e in rounds if e.searches] == searched
     assert [e.fineness for e in rounds] == fineness
     assert [e.rounds for e in rounds if e.goes_ahead] == ([] if choice else [1])
+
+
+def sequential(planner: Planner) -> Entry:
+    """A draft, past its trial, of discs that go one after the other although nothing keeps them from going at once."""
+    plan = roundabout(planner, 0.9)
+    entry = Entry(plan, draft=True, estimate=1.0, patience=planner.portfolio.patience)
+    entry.optimiser = planner.portfolio._optimiser(entry)
+    entry.optimiser.step()
+    entry.optimiser.steps = 100
+    planner.portfolio._entries.append(entry)
+    return entry
+
+
+def test_what_is_still_a_draft_is_timed_anew_before_it_is_given_up(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    portfolio, entry = planner.portfolio, sequential(planner)
+    before, work = entry.outlook, entry.optimiser
+    assert portfolio._choose(1.5) is entry, "another trial instead of its end"
+    assert entry.optimiser is not work and entry.plan.cost < 0.8 * before
+    assert entry.retimings == 1 and entry.on_trial
+    for _ in range(3):
+        while entry in portfolio._entries and entry.on_trial:
+            portfolio.improve(0.1)
+    assert entry not in portfolio._entries, "not for ever"
+
+
+def test_a_plan_that_is_no_draft_any_more_is_not_timed_anew(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    entry = sequential(planner)
+    entry.draft = False
+    assert not planner.portfolio._timed_anew(entry)
+
+
+def test_drafts_are_compared_with_the_incumbent_by_what_second_rounds_have_gained(tmp_path: Path) -> None:
+    planner = planner_for(tmp_path)
+    portfolio, entry = planner.portfolio, sequential(planner)
+    incumbent = entry.outlook / 1.1
+    portfolio._left = [0.95]
+    assert not portfolio.busy(incumbent)
+    portfolio._left = [0.95, 0.80]
+    assert portfolio.busy(incumbent), "it may come to 12 % less"
+    assert portfolio._choose(incumbent) is entry
+    entry.draft, entry.rounds, entry.done, entry.optimiser = False, 1, True, None
+    entry.coarse = entry.plan.cost
+    for share, busy in ((0.85, False), (0.90, True), (1.0, True)):
+        assert portfolio.busy(share * entry.coarse) is busy, "its second round may make it the best"
+    entry.rounds = 2
+    assert not portfolio.busy(10 * entry.coarse), "it has had both"

@@ -1,13 +1,19 @@
-"""Which skeletons are drafted: those that refinement would bring to the same plan as another only once."""
+"""Which skeletons are drafted: those that refinement would bring to the same plan as another only once, and none whose
+ways conflicted before."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from mrtamp.optimise.yielding import Draft, Yielding
 from mrtamp.options import Happening, Skeleton
-from mrtamp.realisation import _CHEAPER, _LIKE, _Drafted
+from mrtamp.planner import Planner
+from mrtamp.realisation import _CHEAPER, _LIKE, Realisation, _Drafted
 from mrtamp.skeleton_guidance import Proposal
+from mrtamp.tasks import pick_place
 from mrtamp.transitions.ways import Stop, Way
 
 ORDER = ((("red", 0, ("a", "b")), ("blue", 0, ("a", "b"))),)
@@ -56,3 +62,33 @@ def test_shortened_handovers_near_to_drafted_ones_are_known(other: Proposal, kno
     drafted.add(proposal([5.0, 5.0], [5.0, 5.0]))
     drafted.add(proposal([0.0, 0.0], [1.0, 1.0], robots=other.ways[0].robots))
     assert drafted.knows(other) is known
+
+
+@pytest.mark.parametrize("spread", [False, True])
+def test_ways_that_conflict_are_not_drafted_together_again(monkeypatch: pytest.MonkeyPatch, spread: bool) -> None:
+    """Where the conflict is `spread` so evenly that nobody is to blame, it is all of them, and no others."""
+    planner = Planner(pick_place(2, 2), seed=0)
+    assert list(planner.improve(20, first=True))
+    sketched: list[set[Way]] = []
+    blamed: list[tuple[int, set[Way]]] = []
+    sketch, time = Realisation._sketch, Yielding.time
+
+    def noted(self: Realisation, proposal: Proposal) -> Draft | None:
+        sketched.append(set(proposal.ways))
+        return sketch(self, proposal)
+
+    def hopeless(self: Yielding, segments: list, transitions: list, *, early: bool = False) -> Draft:
+        draft = time(self, segments, transitions, early=early)
+        first = {r: next(k for k, t in enumerate(transitions) if r in t.active) for r in segments[0].q}
+        objects = {transitions[k].actions[0].object for k in first.values()}
+        ways = {way for way in sketched[-1] if way.stops[0].after and way.stops[0].after.object in objects}
+        blamed.append((len(sketched), ways))
+        return replace(draft, conflict=1.0, blame=dict.fromkeys(first.values(), 0.1 if spread else 1.0))
+
+    monkeypatch.setattr(Realisation, "_sketch", noted)
+    monkeypatch.setattr(Yielding, "time", hopeless)
+    for _ in range(3):
+        planner.realisation.attempt()
+    assert len(sketched) > 5
+    for k, ways in enumerate(sketched):
+        assert not any(pair <= ways for n, pair in blamed if n <= k)

@@ -176,3 +176,18 @@ def test_what_all_ways_of_a_task_have_against_them_counts_for_nothing(tmp_path: 
     for way in before.ways:
         guidance.failed(way)
     assert next(guidance.propose()).skeleton.cost == pytest.approx(before.skeleton.cost)
+
+
+def test_what_conflicts_makes_ways_near_to_it_dearer_and_no_others() -> None:
+    guidance = ready(pick_place(2, 2)).skeletons
+    blamed = next(guidance.propose()).ways[0]
+    [(key, known)] = [(key, ways) for key, ways in guidance.ways.of.items() if blamed in ways]
+    before = {way: way.penalty for ways in guidance.ways.of.values() for way in ways}
+    guidance.crowded({blamed: 0.004})
+    more = {way: way.penalty - penalty for way, penalty in before.items()}
+    assert more[blamed] == pytest.approx(0.4)
+    apart = np.array([np.linalg.norm(way.flat() - blamed.flat()) for way in known])
+    rises = np.array([more[way] for way in known])
+    assert len(known) > 5 and np.all(np.diff(rises[np.argsort(apart)]) <= 0)
+    assert rises[apart > 2.0].max(initial=0.0) < 1e-3
+    assert not any(more[way] for k, ways in guidance.ways.of.items() if k != key for way in ways)

@@ -263,7 +263,7 @@ class Planner:
             return "skeletons" if skeletons and turn else "search"
         to_beat = self._to_beat()
         refine = self._uses("refinement") and not self.portfolio.idle(to_beat)
-        busy = refine and self.portfolio.busy
+        busy = refine and self.portfolio.busy(to_beat)
         if refine and not self.skeletons.has_choice:
             # Others would only be other motions of the same ways: they wait until those there are have converged.
             skeletons = skeletons and not self._one_at_a_time()

@@ -5,19 +5,19 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from mrtamp.collision import RESOLUTION
 from mrtamp.deadline import Deadline
-from mrtamp.effort import Effort
 from mrtamp.incumbent import Incumbent
 from mrtamp.optimise import LocalSearch, Optimiser, Stock, tools_of
 from mrtamp.optimise.legs import order_of
 from mrtamp.optimise.nearness import Nearness
 from mrtamp.optimise.yielding import Draft, Yielding
 from mrtamp.plan import Plan, Segment, Transition
+from mrtamp.portfolio_entry import FIRST, FIRST_SEARCH, LATER, NEARLY, OTHER_WAYS, SAME_WAYS, Entry
 from mrtamp.problem import Problem
 from mrtamp.refine import Refiner
 from mrtamp.transitions.sampler import TransitionSampler
@@ -32,17 +32,11 @@ _ALONE = 1200
 """The same where there is no convex programming."""
 _STALE = 0.004
 """Relative gain of a turn below which shortening has done its part."""
-_TRIAL, _FAST, _SLOWLY = 5, 0.03, 0.01
-"""Conic programs that a plan gets before it is compared with the others, and more as long as each makes it cheaper by
-that share, or at least by that of them (see `_Patience`)."""
 _LUCK = 0.93
 """A draft may come to so many times less than the best one so far, relative to what their skeletons promised."""
-_NEARLY = 0.97
-"""A plan whose current iterate costs less than the incumbent times this goes on until it is free of collision."""
-_CRAWL = 0.01
-"""Share that a first round has to gain in so many programs as `_Patience` says to go on."""
-_PACE, _FURTHER = 3, 6
-"""A first round is expected to go on at the pace of its last programs for so many more."""
+_RETIMINGS, _SOONER, _APART = 2, 0.99, 3e-3
+"""Times that a draft which is about to be given up is timed anew, share of its cost that this may leave at most, and
+its largest conflict then."""
 _ASTRAY = 1.4
 """A plan that costs so many times the least that is possible most likely goes the wrong way around."""
 _ALIKE = 0.02
@@ -54,166 +48,17 @@ WORTH_CHECKING = 0.002
 _PLENTY, _PATIENCE, _LONGER = 0.01, 4, 24
 """Relative gain that is checked at once, and programs after which a smaller one is: more of them where they are small
 ones of local search."""
-
 _POOR = 1.12
 """How many times as much as skeletons promise a converged plan costs that others had better challenge."""
+_FINER = 0.95
+"""What a second round, with re-timing and finer steps, may leave of the cost of a draft, before there was one."""
+_PROMISING = 0.99
+"""Share of the incumbent's cost below which a draft has to be expected to end to go on before there are others."""
 _ROUNDS = 6
 """Rounds without gain after which a plan is left alone."""
-_FIRST_SEARCH = 2
-"""Rounds that have converged before the first that is local search."""
-_FIRST, _LATER = "first rounds", "later rounds"
-"""What turns go to: plans that have not converged, and those that are shaken and refined again."""
 _LAST, _RECENT = 1.5, 6
 """When there is no more time than the judge takes so many times, and the longest of so many programs (with what mends
 their outcome) took, what was gained is checked at once."""
-
-
-@dataclass(frozen=True)
-class _Patience:
-    """How much work a plan gets.
-
-    slow : number of programs up to which its trial goes on even if it becomes cheaper slowly.
-    hopeless : if it costs so many times the best after its trial it waits until nothing else is left to do.
-    lately : number of programs in which a first round has to gain something to go on.
-    shares : least shares of first and of later rounds; as long as neither gains anything first ones have what is left.
-    same_ways : whether there is no choice of ways.
-    local : whether, from the third on, every other round is local search.
-    """
-
-    slow: int
-    hopeless: float
-    lately: int
-    shares: tuple[float, float]
-    same_ways: bool = False
-    local: bool = True
-
-    def effort(self) -> Effort:
-        """Shares out turns to first and later rounds."""
-        first, later = self.shares
-        return Effort({_FIRST: first, _LATER: later}, {_FIRST: 1.0, _LATER: 0.0})
-
-
-_OTHER_WAYS = _Patience(slow=0, hopeless=1.12, lately=5, shares=(0.5, 0.2))
-_SAME_WAYS = _Patience(slow=12, hopeless=1.02, lately=3, shares=(0.5, 0.4), same_ways=True)
-"""Where there is no choice of ways, most plans come near to each other, but with many robots a few end far below."""
-
-
-@dataclass(eq=False)
-class _Entry:
-    """A checked plan and what works on it: convex programming, in later rounds after some shortening.
-
-    A draft is no plan yet: its robots still collide with each other, and convex programs have to pull them apart.
-    """
-
-    plan: Plan
-    draft: bool = False
-    estimate: float = np.nan
-    """What its skeleton was to cost, if it began as a draft."""
-    resolution: float = RESOLUTION
-    refiner: Refiner | None = None
-    optimiser: Optimiser | LocalSearch | None = None
-    proposals: int = 0
-    done: bool = False
-    rounds: int = 0
-    """How often refinement has converged."""
-    fruitless: int = 0
-    """How often since it last gained anything."""
-    before: float = np.inf
-    """Cost when this round began."""
-    trail: list[float] = field(default_factory=list)
-    """Outlook after every conic program of this round."""
-    patience: _Patience = _OTHER_WAYS
-    waiting: int = 0
-    """Conic programs since it has been worth a check."""
-
-    @property
-    def cost(self) -> float:
-        work = self.optimiser or self.refiner
-        return work.cost if work is not None else self.plan.cost
-
-    @property
-    def outlook(self) -> float:
-        """What the plan is likely to cost soon."""
-        return self.optimiser.outlook if self.optimiser is not None else self.cost
-
-    @property
-    def expected(self) -> float:
-        """What it is likely to cost after its first round, where there is no choice of ways; else the outlook."""
-        trail = self.trail[-_PACE - 1 :]
-        if self.rounds or not self.patience.same_ways or len(trail) <= _PACE:
-            return self.outlook
-        return self.outlook - _FURTHER * max(trail[0] - trail[-1], 0.0) / _PACE
-
-    @property
-    def slow(self) -> bool:
-        """Whether a first round gains so little that other plans are worth more; later rounds go on to the end."""
-        # What has not been checked has to be good by then to go on.
-        lately = self.patience.lately * (2 if self.unchecked else 1)
-        trail = self.trail[-lately:]
-        clean = self.optimiser is not None and self.optimiser.cost <= (1 + _CRAWL) * self.outlook
-        return self.rounds == 0 and clean and len(trail) == lately and trail[0] - min(trail) < _CRAWL * trail[-1]
-
-    @property
-    def over(self) -> bool:
-        """Whether convex programming has come to the end of this round."""
-        return self.optimiser is not None and (self.optimiser.converged or self.optimiser.stuck or self.slow)
-
-    @property
-    def on_trial(self) -> bool:
-        """Whether it has begun only just, or gains much with every program of its first round."""
-        if self.rounds or self.done:
-            return False
-        if self.optimiser is None:
-            return True
-        steps = self.optimiser.steps
-        least = _SLOWLY if steps < self.patience.slow else _FAST
-        return steps < _TRIAL or (len(self.trail) > 1 and self.trail[-1] < (1 - least) * self.trail[-2])
-
-    @property
-    def began_as_draft(self) -> bool:
-        return bool(np.isfinite(self.estimate))
-
-    @property
-    def unchecked(self) -> bool:
-        """Whether it is free of collision as far as the planner knows, and the judge has not been asked."""
-        return self.draft and not self.began_as_draft
-
-    @property
-    def size(self) -> int:
-        """Number of knots that a turn works on."""
-        return self.optimiser.knots if self.optimiser is not None else sum(s.length for s in self.plan.segments)
-
-    @property
-    def fresh(self) -> bool:
-        """Whether it has not converged for the first time."""
-        return self.rounds == 0 and not self.done
-
-    @property
-    def fresh_draft(self) -> bool:
-        """Whether it began as a draft and has not converged yet."""
-        return self.rounds == 0 and self.began_as_draft
-
-    @property
-    def goes_ahead(self) -> bool:
-        """Whether, as the incumbent, it has its turns before others: from its trial to the end of its first round of
-        finer steps, which with re-timing gain most, if it began as a draft or there is no choice of ways.
-        """
-        begun = self.rounds == 1 or (self.rounds == 0 and not self.on_trial)
-        return begun and (self.began_as_draft or self.patience.same_ways)
-
-    @property
-    def fineness(self) -> int:
-        """How often convex programs for the whole plan have converged."""
-        return self.rounds - (max(self.rounds - 1, 0) // 2 if self.patience.local else 0)
-
-    @property
-    def searches(self) -> bool:
-        """Whether its round is local search."""
-        return self.patience.local and self.rounds >= _FIRST_SEARCH and self.rounds % 2 == 0
-
-    def is_near(self, incumbent: float) -> bool:
-        """Whether it is about to beat the incumbent clearly."""
-        return bool(self.trail) and self.outlook < _NEARLY * incumbent
 
 
 class Portfolio:
@@ -240,8 +85,8 @@ class Portfolio:
         self.deadline = deadline or Deadline()
         self.convex = convex
         self.sliding = sliding
-        self._patiences = [replace(p, local=local) for p in (_OTHER_WAYS, _SAME_WAYS)]
-        self._entries: list[_Entry] = []
+        self._patiences = [replace(p, local=local) for p in (OTHER_WAYS, SAME_WAYS)]
+        self._entries: list[Entry] = []
         self._settled: list[Plan] = []
         self._seen: set[float] = set()
         self._took: deque[float] = deque(maxlen=_RECENT)
@@ -250,6 +95,8 @@ class Portfolio:
         """Which of the two had its turn last, where there was a choice."""
         self._share = 0.0
         """The least that a draft has cost in the end, relative to its estimate."""
+        self._left = [_FINER]
+        """What second rounds of drafts have left of their cost."""
         self.drafted = False
         """Whether what was worked on last came from a draft and has not converged since."""
         self.patience = self._patiences[0]
@@ -274,7 +121,7 @@ class Portfolio:
             return False
         self._seen.add(round(plan.cost, 6))
         self._entries = [e for e in self._entries if not (e in fresh and e.on_trial)]
-        self._admit([_Entry(plan, patience=self.patience)])
+        self._admit([Entry(plan, patience=self.patience)])
         return True
 
     def add_unchecked(self, segments: list[Segment], transitions: list[Transition]) -> bool:
@@ -284,7 +131,7 @@ class Portfolio:
         if round(plan.cost, 6) in self._seen:
             return False
         self._seen.add(round(plan.cost, 6))
-        entry = _Entry(plan, draft=True, patience=self.patience)
+        entry = Entry(plan, draft=True, patience=self.patience)
         entry.optimiser = self._optimiser(entry)
         self._admit([entry])
         return True
@@ -298,7 +145,7 @@ class Portfolio:
 
     def worth_drafting(self, incumbent: float) -> float:
         """Estimate below which drafts may come to beat the incumbent, from what became of those so far."""
-        return _NEARLY * incumbent / (_LUCK * self._share) if self._share else incumbent
+        return NEARLY * incumbent / (_LUCK * self._share) if self._share else incumbent
 
     def knows(self, transitions: Sequence[Transition]) -> bool:
         """Whether a plan with the same order of events is under refinement."""
@@ -317,13 +164,13 @@ class Portfolio:
                 continue
             self._seen.add(round(plan.cost, 6))
             free = self.incumbent.accepted(draft.segments, draft.transitions) if draft.conflict == 0.0 else None
-            entry = _Entry(free or plan, draft=free is None, estimate=estimate, patience=self.patience)
+            entry = Entry(free or plan, draft=free is None, estimate=estimate, patience=self.patience)
             entry.optimiser = self._optimiser(entry)
             fresh.append(entry)
         self._admit(fresh[::-1])
         return len(fresh)
 
-    def _admit(self, fresh: list[_Entry]) -> None:
+    def _admit(self, fresh: list[Entry]) -> None:
         """Take entries in; when there are too many the dearest of the others go, finished ones first, drafts last.
 
         The cheapest of all stays.
@@ -344,10 +191,12 @@ class Portfolio:
         plan = self._work(entry, incumbent)
         if self._contest is not None:
             gain = incumbent - plan.cost if plan is not None else 0.0
-            self._effort.record(self._contest, entry.size, max(gain, 0.0))
+            # A piece takes hardly less time than a plan of a few robots, but where it is all there is to do it gains.
+            work = entry.size if entry.patience.same_ways else 1.0
+            self._effort.record(self._contest, work, max(gain, 0.0))
         return plan
 
-    def _work(self, entry: _Entry, incumbent: float) -> Plan | None:
+    def _work(self, entry: Entry, incumbent: float) -> Plan | None:
         """A turn of one plan."""
         if entry.optimiser is None and self.convex and entry.rounds == 0 and entry.resolution == RESOLUTION:
             # Shortening gains far less in the time.
@@ -366,14 +215,47 @@ class Portfolio:
         entry.trail.append(entry.optimiser.outlook)
         due = self._due(entry, incumbent) or entry.over
         plan = self._offer(entry, incumbent, entry.optimiser) if due else None
-        if entry.over:
+        if entry.over and not self._timed_anew(entry):
             self._finish(entry, incumbent)
         return plan
 
-    @property
-    def busy(self) -> bool:
-        """Whether a plan is on trial: until it is over, more plans would only wait."""
-        return any(e.on_trial for e in self._entries)
+    def _timed_anew(self, entry: Entry) -> bool:
+        """Whether what is still a draft gets another trial, since its robots can be elsewhere at the time.
+
+        Convex programs never change who goes first where ways cross; with ways as they are by now it may be another.
+        """
+        work = entry.optimiser
+        if not (entry.draft and entry.began_as_draft and isinstance(work, Optimiser) and work.steps):
+            return False
+        if work.stuck or entry.retimings == _RETIMINGS:
+            return False
+        entry.retimings += 1
+        found = [self.yielding.time(*work.latest(), early=early) for early in (False, True)]
+        plans = [self.incumbent.plan(d.segments, d.transitions) for d in found if d.conflict < _APART]
+        best = min(plans, key=lambda p: p.cost, default=None)
+        if best is None or best.cost > _SOONER * entry.outlook:
+            return False
+        entry.plan = best
+        entry.optimiser = self._optimiser(entry)
+        entry.trail.clear()
+        return True
+
+    def busy(self, incumbent: float) -> bool:
+        """Whether a plan is on trial, or a draft is yet to show whether it beats the incumbent: until that is over,
+        more plans would only wait."""
+        return any(e.on_trial or self._promising(e, incumbent) for e in self._entries)
+
+    def _promising(self, entry: Entry, incumbent: float) -> bool:
+        """Whether a draft that has not had its second round may beat the incumbent with it."""
+        young = entry.began_as_draft and entry.rounds <= 1 and not entry.patience.same_ways
+        return young and self._prospect(entry) < _PROMISING * incumbent
+
+    def _prospect(self, entry: Entry) -> float:
+        """What a draft is likely to cost after its second round, from what those so far have gained by theirs; where
+        there is no choice of ways, the outlook."""
+        if entry.patience.same_ways or entry.rounds > 1:
+            return entry.outlook
+        return entry.outlook * self._finer if entry.rounds == 0 else min(entry.outlook, entry.coarse * self._finer)
 
     def suit(self, *, choice: bool) -> None:
         """From now on plans may use different ways; without `choice` they are other motions of the same ones."""
@@ -396,11 +278,11 @@ class Portfolio:
         """
         return any(e.cost <= incumbent + _EPS and self._poor(e, bound) for e in self._entries)
 
-    def _poor(self, entry: _Entry, bound: float | None) -> bool:
+    def _poor(self, entry: Entry, bound: float | None) -> bool:
         # Where there are no other ways, there is nothing better.
         return entry.rounds > 0 and not self.patience.same_ways and entry.cost > _POOR * (bound or np.inf)
 
-    def _hopeful(self, entry: _Entry, incumbent: float) -> bool:
+    def _hopeful(self, entry: Entry, incumbent: float) -> bool:
         """Whether a plan may still beat the incumbent; later rounds take off all plans about the same."""
         best = max(incumbent, self._coarse) if entry.rounds <= 1 else incumbent
         return entry.expected < self.patience.hopeless * best
@@ -418,23 +300,24 @@ class Portfolio:
         """Whether no plan promises a gain any more."""
         return all(e.done and not self._worth_a_round(e, incumbent) for e in self._entries)
 
-    def _worth_a_round(self, entry: _Entry, incumbent: float) -> bool:
+    def _worth_a_round(self, entry: Entry, incumbent: float) -> bool:
         """Whether a plan that has converged is shaken and refined again."""
         return entry.done and entry.fruitless < _ROUNDS and self._hopeful(entry, incumbent)
 
-    def _choose(self, incumbent: float, bound: float | None = None) -> _Entry | None:
+    def _choose(self, incumbent: float, bound: float | None = None) -> Entry | None:
         """One that is about to beat the incumbent; else the incumbent itself if it `goes_ahead`, unless it is poor for
-        what skeletons promise; else, as the shares of both have it, one in its first round, the newest first, or one in
-        a later round.
+        what skeletons promise; else, as the shares of both have it, one in its first round or a later one.
 
+        Of those in their first round the newest on trial goes on, then drafts that may win by their second round.
         What drafts seem to cost before their first program says nothing: those on trial begin with the most promising.
         Drafts that are hopeless are given up.
         """
         self._contest = None
         most = self.worth_drafting(incumbent) if self._share else np.inf
         for entry in [e for e in self._entries if e.draft and self._hopeless(e, incumbent, most)]:
-            self._learn(entry)
-            self._entries.remove(entry)
+            if entry.estimate > most or not self._timed_anew(entry):
+                self._learn(entry)
+                self._entries.remove(entry)
         near = [e for e in self._entries if e.is_near(incumbent)]
         if near:
             return min(near, key=lambda e: e.outlook)
@@ -445,22 +328,29 @@ class Portfolio:
             return self._again(ahead) if ahead.done else ahead
         hopeful = [e for e in self._entries if not e.done and self._hopeful(e, incumbent)]
         trial = [e for e in self._entries if e.on_trial]
-        first = trial[-1] if trial else min((e for e in hopeful if e.fresh), key=lambda e: e.outlook, default=None)
-        begun = [e for e in hopeful if e.rounds]
-        rested = [e for e in self._entries if self._worth_a_round(e, incumbent)]
+        promising = [e for e in self._entries if self._promising(e, incumbent)]
+        first = trial[-1] if trial else min(promising, key=self._prospect, default=None)
+        first = first or min((e for e in hopeful if e.fresh), key=lambda e: e.outlook, default=None)
+        begun = [e for e in hopeful if e.rounds and e not in promising]
+        rested = [e for e in self._entries if self._worth_a_round(e, incumbent) and e not in promising]
         later = min(begun or rested, key=lambda e: e.cost * (1 + 0.02 * e.fruitless), default=None)
         if first is not None and later is not None:
-            self._contest = self._effort.next((_FIRST, _LATER))
-        if first is not None and self._contest != _LATER:
-            return first
+            self._contest = self._effort.next((FIRST, LATER))
+        if first is not None and self._contest != LATER:
+            return self._again(first) if first.done else first
         if later is not None:
             return self._again(later) if later.done else later
         waiting = [e for e in self._entries if not e.done]
         return min(waiting, key=lambda e: e.cost, default=None)
 
-    def _hopeless(self, draft: _Entry, incumbent: float, most: float) -> bool:
+    @property
+    def _finer(self) -> float:
+        """What a second round leaves of the cost of a draft."""
+        return float(np.mean(self._left))
+
+    def _hopeless(self, draft: Entry, incumbent: float, most: float) -> bool:
         """Whether to give up a draft: its estimate is above `most`, where no draft so far has ended cheap enough,
-        or its trial left it no cheaper than the incumbent, and to come free costs it more still.
+        or after its trial it is not expected to end cheaper than the incumbent, and to come free costs it more still.
 
         What is only unchecked has nothing more to pay.
         """
@@ -468,15 +358,15 @@ class Portfolio:
             return True
         if draft.on_trial:
             return False
-        return draft.outlook >= incumbent if draft.began_as_draft else not self._hopeful(draft, incumbent)
+        return self._prospect(draft) >= incumbent if draft.began_as_draft else not self._hopeful(draft, incumbent)
 
     @staticmethod
-    def _again(entry: _Entry) -> _Entry:
+    def _again(entry: Entry) -> Entry:
         """A plan that goes on to its next round."""
         entry.refiner, entry.optimiser, entry.proposals, entry.done = None, None, 0, False
         return entry
 
-    def _shorten(self, entry: _Entry, incumbent: float) -> Plan | None:
+    def _shorten(self, entry: Entry, incumbent: float) -> Plan | None:
         if entry.refiner is None:
             entry.refiner = self._refiner(entry)
             entry.before = entry.plan.cost
@@ -497,7 +387,7 @@ class Portfolio:
             self._finish(entry, incumbent)
         return plan
 
-    def _begin_convex(self, entry: _Entry, work: Refiner, *, judged: bool) -> None:
+    def _begin_convex(self, entry: Entry, work: Refiner, *, judged: bool) -> None:
         """Go on from the shortened plan, if it is worth a check and the judge agrees, else from the one before."""
         if not judged and work.cost < entry.plan.cost * (1 - WORTH_CHECKING):
             plan = self.incumbent.accepted(work.segments(), work.transitions)
@@ -508,7 +398,7 @@ class Portfolio:
         entry.refiner = None
         entry.optimiser = self._optimiser(entry)
 
-    def _optimiser(self, entry: _Entry) -> Optimiser:
+    def _optimiser(self, entry: Entry) -> Optimiser:
         return Optimiser(
             self.problem,
             self.nearness,
@@ -523,15 +413,15 @@ class Portfolio:
             deadline=self.deadline,
         )
 
-    def _local_search(self, entry: _Entry) -> LocalSearch:
+    def _local_search(self, entry: Entry) -> LocalSearch:
         # A piece is small enough for finer steps, which with coarse ones all around gain as much; but where there are
         # many ways of other plans to try, with coarse ones it is twice as many in the time.
-        level = 0 if self.patience.same_ways and entry.rounds == _FIRST_SEARCH else 1
+        level = 0 if self.patience.same_ways and entry.rounds == FIRST_SEARCH else 1
         plan = entry.plan
         what = self.problem, self.nearness, plan.segments, plan.transitions, self.rng
         return LocalSearch(*what, stock=self.stock, level=level, deadline=self.deadline)
 
-    def _finish(self, entry: _Entry, incumbent: float) -> None:
+    def _finish(self, entry: Entry, incumbent: float) -> None:
         """Convergence: what was gained decides whether the plan is worth another round; a draft is given up."""
         work = entry.optimiser
         self._learn(entry)
@@ -545,10 +435,14 @@ class Portfolio:
         if entry.draft:
             self._entries.remove(entry)
             return
-        if entry.began_as_draft:
+        if entry.began_as_draft and entry.rounds > 0:
             # The second round, too, often gains much.
             share = entry.plan.cost / entry.estimate
             self._share = min(self._share or share, share)
+        if entry.rounds == 0:
+            entry.coarse = entry.plan.cost
+        elif entry.rounds == 1 and entry.began_as_draft:
+            self._left.append(entry.plan.cost / entry.coarse)
         if entry.rounds == 0 and self.patience.same_ways:
             self._coarse = min(self._coarse or entry.plan.cost, entry.plan.cost)
         gained = entry.before - entry.plan.cost > WORTH_CHECKING * entry.plan.cost
@@ -558,7 +452,7 @@ class Portfolio:
         entry.done, entry.refiner, entry.optimiser = True, None, None
         self._settled.append(entry.plan)
 
-    def _learn(self, entry: _Entry) -> None:
+    def _learn(self, entry: Entry) -> None:
         """Keep the ways that robots take in a plan that is done with, for the time being or for good."""
         if entry.optimiser is not None and (entry.over or not entry.on_trial):
             self.stock.add(*entry.optimiser.latest())
@@ -568,7 +462,7 @@ class Portfolio:
         out, self._settled = self._settled, []
         return out
 
-    def _offer(self, entry: _Entry, incumbent: float, work: Refiner | Optimiser | LocalSearch) -> Plan | None:
+    def _offer(self, entry: Entry, incumbent: float, work: Refiner | Optimiser | LocalSearch) -> Plan | None:
         """Have a plan checked that is clearly cheaper than the incumbent; where the judge objects, look closer."""
         if work.cost > incumbent * (1 - WORTH_CHECKING):
             return None
@@ -587,7 +481,7 @@ class Portfolio:
             entry.refiner = None
         return None
 
-    def _due(self, entry: _Entry, incumbent: float) -> bool:
+    def _due(self, entry: Entry, incumbent: float) -> bool:
         """Whether the judge is asked now: that takes longer than a program, and the next may gain as much again.
 
         What has been gained when time is nearly up would be lost otherwise.
@@ -602,5 +496,5 @@ class Portfolio:
             entry.waiting = 0
         return due
 
-    def _refiner(self, entry: _Entry) -> Refiner:
+    def _refiner(self, entry: Entry) -> Refiner:
         return Refiner(entry.plan, self.validity, self.rng, entry.resolution)

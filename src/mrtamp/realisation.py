@@ -6,7 +6,8 @@ and changes what it proposes next.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from mrtamp.growth import Growth, Timed
 from mrtamp.incumbent import Incumbent
 from mrtamp.optimise.descent import Descent
 from mrtamp.optimise.yielding import Draft
-from mrtamp.plan import Plan, plan_cost
+from mrtamp.plan import Plan, Transition, plan_cost
 from mrtamp.portfolio import Portfolio
 from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
 from mrtamp.space_time import SpaceTime
@@ -40,6 +41,8 @@ _AT_ONCE = 4
 """Skeletons that are drafted before what was learnt from them changes what is proposed."""
 _CONFLICT = 3e-3
 """Conflict of a draft (see `Draft`) from which on it hardly ever comes free of collision."""
+_GUILTY = 0.25
+"""Share in the conflict from which on a way is to blame for it; where nobody has it, all are."""
 _DETERRENT = 100.0
 """By how many times dearer a skeleton seems for a conflict of 1 in its draft."""
 _POOR = 2.0
@@ -101,7 +104,7 @@ class Realisation:
         self._early = self._urgent = False
         self._drafted = _Drafted()
         self._crowded: set[frozenset[Way]] = set()
-        """Ways whose draft had too much conflict, and in place of which there are no others."""
+        """Ways that conflict too much with each other in a draft."""
 
     def attempt(self) -> Plan | Node | None:
         """Grow the sets of ways and realise the cheapest skeletons that may beat the incumbent, until one succeeds.
@@ -226,7 +229,7 @@ class Realisation:
             found = self.skeletons.propose(below, _THOROUGH)
             proposals, crowded = [], False
             for proposal in found:
-                if frozenset(proposal.ways) in self._crowded:
+                if any(ways <= set(proposal.ways) for ways in self._crowded):
                     crowded = True
                 elif not self._drafted.knows(proposal):
                     proposals.append(proposal)
@@ -238,7 +241,7 @@ class Realisation:
                     return True
                 break
             for proposal in proposals:
-                if frozenset(proposal.ways) in self._crowded or (drafts and not choice):
+                if any(ways <= set(proposal.ways) for ways in self._crowded) or (drafts and not choice):
                     continue
                 sketched += 1
                 draft = self._sketch(proposal)
@@ -259,10 +262,21 @@ class Realisation:
         draft = self.portfolio.yielding.time(*timed, early=self._early)
         if draft.conflict < _CONFLICT:
             return draft
-        self.skeletons.crowded(proposal, draft.conflict)
-        if not self.skeletons.has_choice:
-            self._crowded.add(frozenset(proposal.ways))
+        blamed = self._blamed(proposal, timed[1], draft)
+        self.skeletons.crowded(blamed)
+        guilty = [w for w, much in blamed.items() if much > _GUILTY * draft.conflict]
+        self._crowded.add(frozenset(guilty or proposal.ways))
         return None
+
+    @staticmethod
+    def _blamed(proposal: Proposal, transitions: Sequence[Transition], draft: Draft) -> Mapping[Way, float]:
+        """How much of the conflict of a draft there is on each of its skeleton's ways."""
+        of = {h.task: way for h, (_, way) in zip(proposal.skeleton.happenings, proposal.stops, strict=True)}
+        out = defaultdict[Way, float](float)
+        for k, much in draft.blame.items():
+            for action in transitions[k].actions:
+                out[of[action.subgoal or action.object or ""]] += much
+        return out
 
     def _cheapest_insertion(self, proposal: Proposal) -> tuple[float, Timed, SpaceTime] | None:
         """The cheapest of several realisations of a skeleton in space and time, with its cost and schedule; None if the

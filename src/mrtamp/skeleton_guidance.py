@@ -30,6 +30,8 @@ from mrtamp.transitions.ways import Stop, Way, Ways
 
 _CROWDED = 100.0
 """Added to the estimated cost of a way (rad) for a conflict of 1 (see `mrtamp.optimise.yielding.Draft`)."""
+_LIKE = 0.5
+"""Distance (rad) of all configurations of two ways at which what was learnt of one counts for the other by a third."""
 _FAILED = 2.0
 """Added to the estimated cost of a way (rad) whose stop could not be realised."""
 _REPEATED = 0.04
@@ -469,11 +471,22 @@ class SkeletonGuidance:
             self.failed(way)
         return ways
 
-    def crowded(self, proposal: Proposal, conflict: float) -> None:
-        """Robots would collide a lot on these ways; whose ways are to blame is left to chance."""
-        for way in proposal.ways:
-            if self.rng.random() < 0.5:
-                way.penalty += _CROWDED * conflict
+    def crowded(self, blame: Mapping[Way, float]) -> None:
+        """Robots would collide so much on these ways; those near to them are no better."""
+        for way, conflict in blame.items():
+            known = self._alternatives(way)
+            q, mine = (np.array([w.flat() for w in ways]) for ways in (known, [way]))
+            share = np.exp(-((np.linalg.norm(q - mine, axis=1) / _LIKE) ** 2))
+            for other, much in zip(known, share.tolist(), strict=True):
+                other.penalty += _CROWDED * conflict * much
+
+    def _alternatives(self, way: Way) -> list[Way]:
+        """All ways, itself among them, that do the same with the same robots."""
+        stop = way.stops[0]
+        if stop.subgoal is not None:
+            return self._reach_ways(stop.subgoal)
+        known = next((ways for ways in self.ways.of.values() if way in ways), [way])
+        return [w for w in known if len(w.stops) == len(way.stops)]
 
     def realised(self, proposal: Proposal) -> None:
         """A proposal became a plan; others get their turn, and this order again when it still seems cheapest."""

@@ -14,8 +14,8 @@ from gantry import gantry_problem, valid_plan
 from mrtamp.check import Checker
 from mrtamp.collision import Collision
 from mrtamp.optimise.nearness import Nearness
-from mrtamp.optimise.yielding import _EARLY, Draft, Yielding
-from mrtamp.plan import Plan, plan_cost
+from mrtamp.optimise.yielding import _EARLY, _PARTS, Draft, Yielding, _divided
+from mrtamp.plan import Plan, Segment, Transition, plan_cost
 from mrtamp.problem import Problem
 
 THICK = 0.1
@@ -45,16 +45,26 @@ def to_go(way: np.ndarray) -> np.ndarray:
     return np.append(np.cumsum(steps[::-1])[::-1], 0.0)
 
 
+def depths(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of two ways (T, 2), (N, 2): measured at every sixth node of each, and linear between those."""
+    low = [np.array([[depth(x, y) for y in b[::_PARTS]] for x in a[::_PARTS]])]
+    for n in (len(a), len(b)):
+        columns = [np.interp(np.arange(n), np.arange(0, n, _PARTS), column) for column in low[-1].T]
+        low.append(np.array(columns))
+    return low[-1]
+
+
 def cheapest(a: np.ndarray, b: np.ndarray, *, early: bool) -> float:
     """Over all monotone paths on the grid of two ways (T, 2), (N, 2)."""
     graph = nx.DiGraph()
+    deep = depths(a, b)
     left = to_go(a)[:, None] + to_go(b)
     haste = 1 + _EARLY * early * left / left[0, 0]
     for i, j in product(range(len(a)), range(len(b))):
         for k, m in ((i + 1, j), (i, j + 1), (i + 1, j + 1)):
             if k < len(a) and m < len(b):
                 longest = max(np.linalg.norm(a[k] - a[i]), np.linalg.norm(b[m] - b[j]))
-                graph.add_edge((i, j), (k, m), weight=haste[k, m] * charged(float(longest), depth(a[k], b[m])))
+                graph.add_edge((i, j), (k, m), weight=haste[k, m] * charged(float(longest), deep[k, m]))
     return float(nx.dijkstra_path_length(graph, (0, 0), (len(a) - 1, len(b) - 1)))
 
 
@@ -74,17 +84,20 @@ def test_two_discs_wait_for_each_other_as_brute_force_has_it(
     problem = disc_problem(tmp_path)
     draft = timed(crossing(problem, a_to, b_to), early=early)
     [segment] = draft.segments
+    ways = []
+    for robot, to in zip(problem.robots, (a_to, b_to), strict=True):
+        length = float(np.linalg.norm(np.array(to) - robot.start))
+        ways.append(np.linspace(robot.start, to, _PARTS * int(np.ceil(length / 0.3 - 1e-9)) + 1))
+    deep = depths(*ways)
     a, b = segment.q["a"], segment.q["b"]
+    nodes = [np.linalg.norm(q[:, None] - way, axis=2).argmin(axis=1) for q, way in zip((a, b), ways, strict=True)]
     cost = conflict = 0.0
     left = to_go(a) + to_go(b)
     for i, j in pairwise(range(len(a))):
         longest = max(np.linalg.norm(a[j] - a[i]), np.linalg.norm(b[j] - b[i]))
-        cost += (1 + _EARLY * early * left[j] / left[0]) * charged(float(longest), depth(a[j], b[j]))
-        conflict += float(longest) * depth(a[j], b[j]) ** 2
-    ways = []
-    for robot, to in zip(problem.robots, (a_to, b_to), strict=True):
-        length = float(np.linalg.norm(np.array(to) - robot.start))
-        ways.append(np.linspace(robot.start, to, int(np.ceil(length / 0.3 - 1e-9)) + 1))
+        at = deep[nodes[0][j], nodes[1][j]]
+        cost += (1 + _EARLY * early * left[j] / left[0]) * charged(float(longest), at)
+        conflict += float(longest) * at**2
     assert cost == pytest.approx(cheapest(*ways, early=early), rel=2e-3)
     assert draft.conflict == pytest.approx(conflict, abs=1e-5)
     for robot, to, q in zip(problem.robots, (a_to, b_to), (a, b), strict=True):
@@ -149,3 +162,45 @@ def test_who_need_not_wait_does_not(tmp_path: Path) -> None:
     lengths = {"a": 0.4, "b": 0.4 + 0.4 + 1.0}
     cost = plan_cost(draft.segments, draft.transitions, problem.cost) - problem.cost.of_changes(["reach"] * 3)
     assert cost == pytest.approx(max(lengths.values()) + 0.01 * sum(lengths.values())), "a moves while b does"
+
+
+def test_the_events_that_robots_are_on_their_way_to_are_to_blame(tmp_path: Path) -> None:
+    """b has taken the token long before it comes back to where a ends, and stays."""
+    problem = disc_problem(tmp_path)
+    plan = (
+        Errands(problem)
+        .move(b=(0.9, -0.5))
+        .reach("take")
+        .move(a=(-0.5, -0.9), b=(0.5, -0.5))
+        .move(b=(0.5, 0.5))
+        .reach("drop", "visit")
+        .move(a=(-0.5, -0.5), b=(0.5, -0.5))
+        .move(b=(-0.5, -0.65))
+        .plan()
+    )
+    split = [
+        Transition((action,)) for t in plan.transitions for action in sorted(t.actions, key=lambda a: str(a.subgoal))
+    ]
+    assert [t.actions[0].subgoal for t in split] == ["take", "drop", "visit"]
+    segments = [*plan.segments[:2], *plan.segments[1:]]
+    last = {r: q[-1:] for r, q in plan.segments[1].q.items()}
+    segments[2] = Segment(plan.segments[1].mode.after(split[1]), last)
+    draft = Yielding(problem, Nearness(Collision(problem))).time(segments, split)
+    assert draft.conflict > 0
+    assert draft.blame[1] == pytest.approx(draft.conflict) == draft.blame[2]
+    assert draft.blame.get(0, 0.0) == pytest.approx(0.0)
+
+
+def test_ways_are_divided_evenly_and_cut_short_nowhere_but_at_slight_bends() -> None:
+    corner = np.array([[0, 0], [0.5, 0], [0.5, 0], [1.0, 0.1], [1.0, 1.0]], dtype=float)
+    stretches = list(_divided(corner))
+    assert len(stretches) == 2
+    start, whole = corner[0], 0.0
+    for (nodes, n), end in zip(stretches, corner[[3, 4]], strict=True):
+        steps = np.linalg.norm(np.diff(np.vstack([start, nodes]), axis=0), axis=1)
+        assert len(nodes) == n * _PARTS and steps.max() <= 0.3 / _PARTS + 1e-9
+        assert steps.max() - steps.min() < 1e-3
+        assert np.array_equal(nodes[-1], end)
+        start, whole = end, whole + steps.sum()
+    assert whole == pytest.approx(0.5 + np.hypot(0.5, 0.1) + 0.9, abs=1e-3)
+    assert not list(_divided(np.zeros((3, 2))))

@@ -8,7 +8,8 @@ these are by how far along it is, with the depth of penetration charged along th
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,8 +21,11 @@ from mrtamp.plan import Segment, Transition
 from mrtamp.problem import Problem
 from mrtamp.refine import must_follow
 
-_STEP = 0.3
-"""Longest step (rad or m) of a robot along its way."""
+_STEP, _PARTS = 0.3, 6
+"""Distance (rad or m) along a way at which penetrations are measured, and steps of equal length from one to the next:
+robots take them at the same time, which costs little only where they are about equally long."""
+_SHARP = np.cos(np.deg2rad(30.0))
+"""Cosine of the turn from which on a way is not cut short between steps."""
 _CHARGE = (10.0, 300.0)
 """By how many times motion at a penetration of 1 m seems longer than it is: linear and quadratic in the depth."""
 _EARLY = 0.3
@@ -34,12 +38,14 @@ _NEVER = 1e6
 class Draft:
     """Motions that may still collide; `conflict` is the squared depth of penetration (m^2) along the motion (rad or m).
 
-    What is grazed for long is easily pulled apart; robots that pass through each other are not.
+    What is grazed for long is easily pulled apart; robots that pass through each other are not.  `blame` has how much
+    of it there is on the way to events, by their number among those that were to be timed, for all who are involved.
     """
 
     segments: list[Segment]
     transitions: list[Transition]
     conflict: float
+    blame: Mapping[int, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +57,8 @@ class _Course:
     stage : number (M,) of the robot's own events up to each node.
     held : what the robot holds after each number of events.
     done : event -> the first node after it.
-    state : its bodies and its load at the nodes.
+    looked : numbers (C,) of the nodes at which penetrations are measured.
+    state : its bodies and its load at those.
     """
 
     q: np.ndarray
@@ -59,7 +66,22 @@ class _Course:
     stage: np.ndarray
     held: list[Attachment | None]
     done: dict[int, int]
+    looked: np.ndarray
     state: State
+
+    def spread(self, depth: np.ndarray) -> np.ndarray:
+        """Depths (M, ...) at all nodes, linear between those (C, ...) that were measured."""
+        nodes = np.arange(len(self.q))
+        low = np.searchsorted(self.looked, nodes, side="right") - 1
+        high = np.minimum(low + 1, len(self.looked) - 1)
+        part = (nodes - self.looked[low]) / np.maximum(self.looked[high] - self.looked[low], 1)
+        part = part.reshape(-1, *[1] * (depth.ndim - 1))
+        return (1 - part) * depth[low] + part * depth[high]
+
+    def on_the_way_to(self, nodes: np.ndarray) -> np.ndarray:
+        """The event (P,) that is next at nodes (P,), after the last of them that one; there has to be one."""
+        events = np.array(list(self.done))
+        return events[np.minimum(self.stage[nodes], len(events) - 1)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +92,16 @@ class _Rest:
     X_WO: np.ndarray
     since: int | None
     until: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Depth:
+    """Penetration (T, N) at instants of those who are timed already and nodes of the next; whose it is, or of an object
+    that an event has put where it rests, or takes away."""
+
+    depth: np.ndarray
+    robots: tuple[str, ...]
+    event: int | None = None
 
 
 class _Situations:
@@ -116,37 +148,43 @@ class Yielding:
         names = sorted(courses, key=lambda r: -courses[r].step.sum())
         nodes = {names[0]: np.arange(len(courses[names[0]].q))}
         conflict = 0.0
+        blame = defaultdict[int, float](float)
         for name in names[1:]:
-            nodes, more = self._join(courses, nodes, name, rests, before, early)
+            nodes, more = self._join(courses, nodes, name, rests, before, early, blame)
             conflict += more
-        return Draft(*_timed(segments[0].mode, transitions, courses, nodes), conflict)
+        return Draft(*_timed(segments[0].mode, transitions, courses, nodes), conflict, blame)
 
     # -- ways and what stands in them -------------------------------------------------------------------------------
 
     def _course(self, robot: str, segments: Sequence[Segment], transitions: Sequence[Transition]) -> _Course:
-        q, stage = [segments[0].q[robot][0]], [0]
         held, done = [segments[0].mode.held.get(robot)], {}
-        for k, segment in enumerate(segments):
-            for x in segment.q[robot][1:]:
-                last = q[-1]
-                way = float(np.linalg.norm(x - last))
-                if way > 0:
-                    n = max(1, int(np.ceil(way / _STEP - 1e-9)))
-                    q += [*(last + (x - last) * (j / n) for j in range(1, n)), x]
-                    stage += n * [len(held) - 1]
-            if k < len(transitions) and robot in transitions[k].active:
-                done[k] = len(q)
+        legs: list[np.ndarray] = [segments[0].q[robot][:1]]
+        stage, looked = [0], [0]
+        way = [segments[0].q[robot]]
+        for k in range(len(segments)):
+            acts = k < len(transitions) and robot in transitions[k].active
+            if k + 1 < len(segments) and not acts:
+                way.append(segments[k + 1].q[robot][1:])
+                continue
+            for part, n in _divided(np.concatenate(way)):
+                looked += range(len(stage) + _PARTS - 1, len(stage) + n * _PARTS, _PARTS)
+                stage += n * _PARTS * [len(held) - 1]
+                legs.append(part)
+            if acts:
+                done[k] = len(stage)
                 held.append(segments[k + 1].mode.held.get(robot))
-                q.append(q[-1])
+                way = [segments[k + 1].q[robot]]
+                legs.append(way[0][:1])
+                looked.append(len(stage))
                 stage.append(len(held) - 1)
-        nodes, stages = np.array(q), np.array(stage)
+        nodes, stages, at = np.concatenate(legs), np.array(stage), np.array(looked)
         step = np.concatenate([[0.0], np.linalg.norm(np.diff(nodes, axis=0), axis=1)])
-        samples = Samples(np.arange(len(nodes)), np.zeros(len(nodes)), stages)
+        samples = Samples(np.arange(len(at)), np.zeros(len(at)), stages[at])
         holding = _Situations()
         for a in held:
             holding.add([a], {})
-        state = self.nearness.state(robot, nodes, samples, holding.modes)
-        return _Course(nodes, step, stages, held, done, state)
+        state = self.nearness.state(robot, nodes[at], samples, holding.modes)
+        return _Course(nodes, step, stages, held, done, at, state)
 
     def _rests(self, modes: Sequence[Mode]) -> list[_Rest]:
         """Where objects rest that do not rest there all the time."""
@@ -188,17 +226,20 @@ class Yielding:
         rests: Sequence[_Rest],
         before: Mapping[int, set[int]],
         early: bool,
+        blame: defaultdict[int, float],
     ) -> tuple[dict[str, np.ndarray], float]:
-        """Nodes (T',) of all robots at instants, and their conflict, once `robot` is timed against those in `nodes`."""
+        """Nodes (T',) of all robots at instants, and their conflict, once `robot` is timed against those in `nodes`;
+        its share is added to the `blame` of events."""
         course = courses[robot]
         instants = len(next(iter(nodes.values())))
-        depth = np.zeros((instants, len(course.q)))
         done = {k: int(np.argmax(nodes[r] >= node)) for r in nodes for k, node in courses[r].done.items()}
+        parts = list(self._depths_at_rests(courses, nodes, robot, rests, done))
         for other, at in nodes.items():
-            used, inverse = np.unique(at, return_inverse=True)
-            depth += self._depths(other, courses[other], used, robot, course)[inverse]
-        for name in [robot, *nodes]:
-            depth += self._depths_at_rests(courses, nodes, name, robot, rests, done)
+            measured = self._depths(other, courses[other], robot, course)
+            parts.append(_Depth(course.spread(courses[other].spread(measured)[at].T).T, (other, robot)))
+        depth = np.zeros((instants, len(course.q)))
+        for part in parts:
+            depth += part.depth
         never = np.zeros(depth.shape, dtype=bool)
         for k, node in course.done.items():
             for t in [done[j] for j in (*before[k], k) if j in done]:
@@ -210,20 +251,25 @@ class Yielding:
         step = np.zeros(instants)
         for r, at in nodes.items():
             step = np.maximum(step, np.where(np.diff(at, prepend=0) > 0, courses[r].step[at], 0.0))
-        row, column, conflict = _cheapest(step, course.step, depth, never, _EARLY if early else 0.0)
-        return {**{r: at[row] for r, at in nodes.items()}, robot: column}, conflict
+        row, column, length = _cheapest(step, course.step, depth, never, _EARLY if early else 0.0)
+        out = {**{r: at[row] for r, at in nodes.items()}, robot: column}
+        for part in parts:
+            share = length * depth[row, column] * part.depth[row, column]
+            for k, much in _attributed(part, share, courses, out):
+                blame[k] += much
+        return out, float(length @ depth[row, column] ** 2)
 
-    def _depths(self, one: str, a: _Course, used: np.ndarray, two: str, b: _Course) -> np.ndarray:
-        """Deepest penetration (U, N) of robot one at its nodes `used` (U,) and robot two at all of its nodes."""
-        out = np.zeros((len(used), len(b.q)))
-        U, N = _overlapping(a.state.of(used), b.state)
+    def _depths(self, one: str, a: _Course, two: str, b: _Course) -> np.ndarray:
+        """Deepest penetration (C, D) of robots one and two where it is measured along their ways."""
+        out = np.zeros((len(a.looked), len(b.looked)))
+        U, N = _overlapping(a.state, b.state)
         if not len(U):
             return out
-        states = a.state.of(used[U]), b.state.of(N)
+        states = a.state.of(U), b.state.of(N)
         situations = _Situations()
         for x, y in itertools.product(a.held, b.held):
             situations.add([x, y], {})
-        of = a.stage[used[U]] * len(b.held) + b.stage[N]
+        of = a.stage[a.looked[U]] * len(b.held) + b.stage[b.looked[N]]
         samples = Samples(np.arange(len(U)), np.zeros(len(U)), of)
         near = self.nearness.between((one, two), states, samples, situations, 0.0)
         out[U, N] = _deepest(near, len(U))
@@ -233,53 +279,81 @@ class Yielding:
         self,
         courses: Mapping[str, _Course],
         nodes: Mapping[str, np.ndarray],
-        name: str,
         robot: str,
         rests: Sequence[_Rest],
         done: Mapping[int, int],
-    ) -> np.ndarray:
-        """Penetration (T, N) of robot `name` and objects at rest, as far as it depends on when `robot` does what.
+    ) -> Iterator[_Depth]:
+        """Penetration of each robot and objects at rest, as far as it depends on when `robot` does what.
 
         `done` tells when the others' events happen.  What depends on robots that are timed later is charged then.
         """
-        mine, course = courses[robot], courses[name]
+        mine = courses[robot]
         instants = len(next(iter(nodes.values())))
-        out = np.zeros((instants, len(mine.q)))
-        for rest in rests:
+        for name, rest in itertools.product([robot, *nodes], rests):
+            course = courses[name]
             events = {k for k in (rest.since, rest.until) if k is not None}
             if not events <= {*done, *mine.done} or events <= set(course.done):
                 continue
             if name != robot and not events & set(mine.done):
                 continue
-            there = np.ones(out.shape, dtype=bool)
+            there = np.ones((instants, len(mine.q)), dtype=bool)
             for k, present in ((rest.since, True), (rest.until, False)):
                 if k is not None:
-                    over = np.zeros(out.shape, dtype=bool)
+                    over = np.zeros(there.shape, dtype=bool)
                     over[done.get(k, instants) :] = True
                     over[:, mine.done.get(k, len(mine.q)) :] = True
                     there &= over == present
-            depth = self._depth_at(name, course, rest)
-            out += there * (depth[None] if name == robot else depth[nodes[name]][:, None])
-        return out
+            depth = course.spread(self._depth_at(name, course, rest))
+            if depth.any():
+                at = depth[None] if name == robot else depth[nodes[name]][:, None]
+                yield _Depth(there * at, (name,), rest.since if rest.since is not None else rest.until)
 
     def _depth_at(self, robot: str, course: _Course, rest: _Rest) -> np.ndarray:
-        """Deepest penetration (M,) of a robot at its nodes and an object where it rests."""
-        out = np.zeros(len(course.q))
+        """Deepest penetration (C,) of a robot where it is measured along its way and an object where it rests."""
+        out = np.zeros(len(course.looked))
+        stage = course.stage[course.looked]
         item = rest.at.object
         gap = np.linalg.norm(course.state.centres - rest.X_WO[:3, 3], axis=2) - course.state.radii
-        holds = np.array([a is not None and a.object == item for a in course.held])[course.stage]
+        holds = np.array([a is not None and a.object == item for a in course.held])[stage]
         close = np.flatnonzero((gap.min(axis=1) < self._radius[item]) & ~holds)
         if not len(close):
             return out
         situations = _Situations()
         for a in course.held:
             situations.add([a], {item: rest.X_WO})
-        samples = Samples(close, np.zeros(len(close)), course.stage[close])
+        samples = Samples(close, np.zeros(len(close)), stage[close])
         near = self.nearness.world(robot, course.state.of(close), samples, situations, 0.0)
         number = self.nearness.carriers.number["object", item]
         about = (near.a == number) | (near.b == number)
         out[close] = _deepest(near, len(close), about)
         return out
+
+
+def _divided(way: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
+    """Nodes (n * _PARTS, m) along stretches of a way (K, m) between sharp turns, without the first of each, and n."""
+    way = way[np.concatenate([[True], np.any(np.diff(way, axis=0) != 0, axis=1)])]
+    steps = np.diff(way, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    turns = np.einsum("ij,ij->i", steps[:-1], steps[1:]) < _SHARP * lengths[:-1] * lengths[1:]
+    for a, b in itertools.pairwise([0, *(np.flatnonzero(turns) + 1).tolist(), len(steps)] if len(steps) else []):
+        n = max(1, int(np.ceil((along[b] - along[a]) / _STEP - 1e-9)))
+        x = np.linspace(along[a], along[b], n * _PARTS + 1)[1:]
+        nodes = np.column_stack([np.interp(x, along, column) for column in way.T])
+        nodes[-1] = way[b]
+        yield nodes, n
+
+
+def _attributed(
+    part: _Depth, share: np.ndarray, courses: Mapping[str, _Course], nodes: Mapping[str, np.ndarray]
+) -> Iterator[tuple[int, float]]:
+    """Events and their shares of a conflict (P,) along instants (P,): all that are involved have the whole of it."""
+    if part.event is not None:
+        yield part.event, float(share.sum())
+    for name in part.robots:
+        if courses[name].done:
+            events, which = np.unique(courses[name].on_the_way_to(nodes[name]), return_inverse=True)
+            yield from zip(events.tolist(), np.bincount(which, share).tolist(), strict=True)
 
 
 def _deepest(near: Near, n: int, among: np.ndarray | slice = slice(None)) -> np.ndarray:
@@ -302,8 +376,8 @@ def _overlapping(a: State, b: State) -> tuple[np.ndarray, np.ndarray]:
 
 def _cheapest(
     rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, never: np.ndarray, early: float = 0.0
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """A cheapest monotone path from corner to corner: rows (P,), columns (P,), and the squared depth along it.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A cheapest monotone path from corner to corner: rows (P,), columns (P,), and how long each step takes (P,).
 
     A step of rows (T,) and columns (N,), or of one of them, takes as long as the longer of the two; with everything
     still ahead it costs by the share `early` more than in the end.
@@ -323,8 +397,7 @@ def _cheapest(
             base[1:] = np.minimum(base[1:], cost[t - 1, :-1] + both[t, 1:] + _NEVER * never[t, 1:])
         cost[t] = along[t] + np.minimum.accumulate(base - along[t])
     t, n = len(rows) - 1, len(columns) - 1
-    path = [(t, n)]
-    conflict = 0.0
+    path, length = [(t, n)], []
     while t or n:
         choices = []
         if t and n:
@@ -334,11 +407,11 @@ def _cheapest(
         if n:
             choices.append((cost[t, n - 1] + columns[n] * charge[t, n], t, n - 1))
         _, u, m = min(choices)
-        conflict += depth[t, n] ** 2 * max(rows[t] * (t - u), columns[n] * (n - m))
+        length.append(max(rows[t] * (t - u), columns[n] * (n - m)))
         t, n = u, m
         path.append((t, n))
     row, column = np.array(path[::-1]).T
-    return row, column, float(conflict)
+    return row, column, np.array([0.0, *length[::-1]])
 
 
 def _timed(

@@ -67,6 +67,10 @@ class Way:
         """Who takes part, in the order in which they do."""
         return tuple(dict.fromkeys(r for stop in self.stops for r in stop.robots))
 
+    def flat(self) -> np.ndarray:
+        """The configurations of all its stops, one after the other."""
+        return np.concatenate([stop.q[r] for stop in self.stops for r in stop.robots])
+
 
 Slid = tuple[Sequence[Mapping[str, np.ndarray]], Sequence[Attachment]]
 """What a way has become: for every stop the configurations of its robots, and what is attached after it."""
