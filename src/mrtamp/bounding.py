@@ -104,15 +104,13 @@ class Bounds:
 
     def spheres(self, q: np.ndarray) -> np.ndarray:
         """World centres (N, B, 3) at configurations q (N, n)."""
-        R, p = self.chain.poses(q, self.bodies)
-        return self.moved(R, p)
+        return self._moved(*self.chain.poses(q, self.bodies))
 
     def placed(self, Rs: Sequence[np.ndarray], ps: Sequence[np.ndarray]) -> np.ndarray:
         """World centres (N, B, 3) where all bodies of the chain are at Rs (N, 3, 3), ps (N, 3), see `Chain.sweep`."""
-        rows = [self.chain.index[b] for b in self.bodies]
-        return self.moved(np.stack([Rs[i] for i in rows]), np.stack([ps[i] for i in rows]))
+        return self._moved(*self.chain.stacked(Rs, ps, self.bodies))
 
-    def moved(self, R: np.ndarray, p: np.ndarray) -> np.ndarray:
+    def _moved(self, R: np.ndarray, p: np.ndarray) -> np.ndarray:
         """World centres (N, B, 3) where the bodies are at R (B, N, 3, 3), p (B, N, 3)."""
         return np.swapaxes(p + np.einsum("bnij,bj->bni", R, self.centres), 0, 1)
 

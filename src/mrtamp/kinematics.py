@@ -171,6 +171,10 @@ class Chain:
     def poses(self, q: Array, bodies: list[str] | None = None) -> tuple[Array, Array]:
         """World poses of `bodies` (default: all): R (B, N, 3, 3), p (B, N, 3) for configurations q (N, n)."""
         Rs, ps, _ = self.sweep(q)
+        return self.stacked(Rs, ps, bodies)
+
+    def stacked(self, Rs: Sequence[Array], ps: Sequence[Array], bodies: list[str] | None = None) -> tuple[Array, Array]:
+        """The same, where a sweep has found all bodies at Rs (N, 3, 3), ps (N, 3)."""
         rows = range(len(self.links)) if bodies is None else [self.index[b] for b in bodies]
         return np.stack([Rs[i] for i in rows]), np.stack([ps[i] for i in rows])
 

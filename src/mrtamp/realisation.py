@@ -229,7 +229,7 @@ class Realisation:
             found = self.skeletons.propose(below, _THOROUGH)
             proposals, crowded = [], False
             for proposal in found:
-                if any(ways <= set(proposal.ways) for ways in self._crowded):
+                if self._conflicts(proposal):
                     crowded = True
                 elif not self._drafted.knows(proposal):
                     proposals.append(proposal)
@@ -241,7 +241,7 @@ class Realisation:
                     return True
                 break
             for proposal in proposals:
-                if any(ways <= set(proposal.ways) for ways in self._crowded) or (drafts and not choice):
+                if self._conflicts(proposal) or (drafts and not choice):
                     continue
                 sketched += 1
                 draft = self._sketch(proposal)
@@ -267,6 +267,10 @@ class Realisation:
         guilty = [w for w, much in blamed.items() if much > _GUILTY * draft.conflict]
         self._crowded.add(frozenset(guilty or proposal.ways))
         return None
+
+    def _conflicts(self, proposal: Proposal) -> bool:
+        """Whether some of its ways conflicted in a draft before."""
+        return any(ways <= set(proposal.ways) for ways in self._crowded)
 
     @staticmethod
     def _blamed(proposal: Proposal, transitions: Sequence[Transition], draft: Draft) -> Mapping[Way, float]:

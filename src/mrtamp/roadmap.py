@@ -213,6 +213,10 @@ class Roadmap:
                 del self._spheres[next(iter(self._spheres))]
         return known
 
+    def path_length(self, path: Sequence[int]) -> float:
+        """Joint distance along vertices (rad or m)."""
+        return float(np.linalg.norm(np.diff(self.q[list(path)], axis=0), axis=1).sum())
+
     def offer_direct(self, a: int, b: int) -> None:
         """Make the straight edges between the exits of two vertices: a k-nearest roadmap hides near-optimal ones."""
         for i in self.exits.get(a, [a]):

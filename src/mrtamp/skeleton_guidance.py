@@ -7,7 +7,6 @@ where that fails or is dearer, the ways concerned are held to be dearer too (DES
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -436,8 +435,7 @@ class SkeletonGuidance:
                 _ROUNDS,
                 lambda: self.connector.connect(roadmap, self.root, a, b, _TREE),
             )
-            pairs = itertools.pairwise(path or [])
-            length = sum(float(np.linalg.norm(roadmap.q[u] - roadmap.q[v])) for u, v in pairs) if path else np.inf
+            length = roadmap.path_length(path) if path else np.inf
             known = self._lengths[robot, a, b] = (roadmap.n_vertices, length)
         return known[1]
 

@@ -231,7 +231,7 @@ class Steering:
         Refinement never leaves the homotopy class of a path, and a sparse roadmap may know a poor one only.
         """
         start, goal = path[0], path[-1]
-        length, direct = _length(roadmap, path), _length(roadmap, [start, goal])
+        length, direct = roadmap.path_length(path), roadmap.length(start, goal)
         if length < max((_THOROUGH if self.thorough else _LONG) * direct, direct + _FAR_ROUND):
             return path
         tries = self._worth_seeking("shorter", roadmap.name, mode.key, start, goal)
@@ -240,7 +240,7 @@ class Steering:
         longest = _SHORTER * length
         effort = _TREE << min(tries, _SEARCHES) >> 1
         found = self.connector.connect(roadmap, mode, start, goal, effort, longest=longest) if tries else None
-        if found is None or _length(roadmap, found) > longest:
+        if found is None or roadmap.path_length(found) > longest:
             return path
         return found if all(validate(roadmap.edge(u, v)) for u, v in itertools.pairwise(found)) else path
 
@@ -272,8 +272,3 @@ class Steering:
     def step_is_valid(self, mode: Mode, a: At, b: At) -> bool:
         """LazyValidate one synchronous step."""
         return step_is_valid(self.roadmaps, self.validity, mode, a, b)
-
-
-def _length(roadmap: Roadmap, path: list[int]) -> float:
-    """Joint distance along vertices."""
-    return float(np.linalg.norm(np.diff(roadmap.q[path], axis=0), axis=1).sum())

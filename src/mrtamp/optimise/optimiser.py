@@ -225,9 +225,8 @@ class Optimiser:
 
     def _guilty(self, violation: Violation, arrangement: Arrangement) -> Who:
         held = arrangement.modes[violation.segment or 0].held
-        carrier = {a.object: r for r, a in held.items()}
-        owners = [carrier.get(s.owner, s.owner) for s in violation.sides or ()]
-        return tuple(dict.fromkeys(r for r in self.worlds if r in owners))
+        robots, _ = violation.guilty({a.object: r for r, a in held.items()}, self.worlds)
+        return tuple(r for r in self.worlds if r in robots)
 
     def _fix(self) -> None:
         """Start again from the last confirmed iterate with transitions that stay as they are."""
