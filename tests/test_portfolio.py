@@ -272,6 +272,23 @@ def test_patience_follows_the_choice_there_is(tmp_path: Path) -> None:
     assert slow[0] == slow[2] > slow[1]
 
 
+@pytest.mark.parametrize(("choice", "gain", "over"), [(False, 1e-4, True), (False, 5e-3, False), (True, 1e-4, False)])
+def test_a_second_round_goes_on_while_it_gains_what_other_motions_would(
+    tmp_path: Path, choice: bool, gain: float, over: bool
+) -> None:
+    """Where there is a choice of ways it goes on to the end."""
+    planner = planner_for(tmp_path)
+    portfolio = planner.portfolio
+    portfolio.suit(choice=choice)
+    portfolio.add(roundabout(planner, 0.6))
+    [entry] = portfolio._entries
+    entry.optimiser, entry.rounds = portfolio._optimiser(entry), 1
+    for k in range(4):
+        assert not entry.over, "it is too early to say"
+        entry.trail.append(2.0 * (1 - gain) ** k)
+    assert entry.over == over
+
+
 def test_what_has_converged_goes_on_beside_what_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """However many new plans come, what is refined further has its share of the turns, and new plans have theirs."""
     planner = planner_for(tmp_path)

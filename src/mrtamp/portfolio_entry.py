@@ -17,6 +17,9 @@ _TRIAL, _FAST, _SLOWLY = 5, 0.03, 0.01
 that share, or at least by that of them (see `Patience`)."""
 _CRAWL = 0.01
 """Share that a first round has to gain in so many programs as `Patience` says to go on."""
+_CREEP, _LATELY = 0.004, 4
+"""The same for later rounds where there is no choice of ways, and in how many programs: another motion of the same
+ways, from the start, gains more than the last of their programs."""
 _PACE, _FURTHER = 3, 6
 """A first round is expected to go on at the pace of its last programs for so many more."""
 NEARLY = 0.97
@@ -53,7 +56,7 @@ class Patience:
 
 
 OTHER_WAYS = Patience(slow=0, hopeless=1.12, lately=5, shares=(0.5, 0.2))
-SAME_WAYS = Patience(slow=12, hopeless=1.02, lately=3, shares=(0.5, 0.4), same_ways=True)
+SAME_WAYS = Patience(slow=12, hopeless=1.02, lately=3, shares=(0.5, 0.12), same_ways=True)
 """Where there is no choice of ways, most plans come near to each other, but with many robots a few end far below."""
 
 
@@ -109,7 +112,13 @@ class Entry:
 
     @property
     def slow(self) -> bool:
-        """Whether a first round gains so little that other plans are worth more; later rounds go on to the end."""
+        """Whether a round gains so little that other plans are worth more.
+
+        Where there is a choice of ways, and in local search, later rounds go on to the end.
+        """
+        if self.rounds and self.patience.same_ways and isinstance(self.optimiser, Optimiser):
+            recent = self.trail[-_LATELY:]
+            return len(recent) == _LATELY and recent[0] - min(recent) < _CREEP * recent[-1]
         # What has not been checked has to be good by then to go on.
         lately = self.patience.lately * (2 if self.unchecked else 1)
         trail = self.trail[-lately:]

@@ -14,7 +14,7 @@ from test_local_search import around, plan_of, search, taut
 
 from mrtamp.check import check_plan
 from mrtamp.collision import Collision
-from mrtamp.optimise import LocalSearch, Stock, local_search, tools_of
+from mrtamp.optimise import LocalSearch, Optimiser, Stock, local_search, tools_of
 from mrtamp.optimise.legs import Way, legs_of, order_of
 from mrtamp.optimise.nearness import Nearness
 from mrtamp.optimise.piece import Whole
@@ -86,13 +86,38 @@ def test_a_way_in_place_of_another_has_its_ends(by_the_clock: bool) -> None:
     mine, theirs = np.cumsum(rng.normal(size=(2, 12, 3)), axis=1)
     clock = np.sort(rng.uniform(0, 1, 12))
     way = Way(theirs, clock, ())
-    np.testing.assert_allclose(way.instead_of(theirs, clock if by_the_clock else None), theirs, atol=1e-9)
-    fresh = way.instead_of(mine, clock if by_the_clock else None)
+    u, same = way.instead_of(theirs, clock if by_the_clock else None)
+    np.testing.assert_allclose(u, np.arange(12))
+    np.testing.assert_allclose(same, theirs, atol=1e-9)
+    u, fresh = way.instead_of(mine, clock if by_the_clock else None)
+    assert set(range(12)) <= set(u) and np.all(np.diff(u) > 0)
     np.testing.assert_allclose(fresh[[0, -1]], mine[[0, -1]])
-    # Without different ends it goes where the other went.
-    shifted = Way(theirs - theirs[0] + mine[0], clock, ())
-    way_there = shifted.instead_of(np.linspace(mine[0], shifted.q[-1], 400))
-    assert all(np.linalg.norm(way_there - x, axis=1).min() < 0.05 for x in shifted.q)
+
+
+def test_a_way_in_place_of_another_keeps_its_corners() -> None:
+    rng = np.random.default_rng(4)
+    way = Way(np.cumsum(rng.normal(size=(12, 3)), axis=0), np.linspace(0, 1, 12), ())
+    straight = np.linspace(way.q[0], way.q[-1], 5)
+    u, fresh = way.instead_of(straight)
+    assert len(u) == 5 + 10
+    assert all(np.linalg.norm(fresh - x, axis=1).min() < 1e-9 for x in way.q)
+    lengths = [np.linalg.norm(np.diff(q, axis=0), axis=1).sum() for q in (fresh, way.q)]
+    assert lengths[0] == pytest.approx(lengths[1])
+
+
+def test_of_two_ways_that_are_alike_the_shorter_is_kept(tmp_path: Path) -> None:
+    plan = around(tmp_path)
+
+    def past(y: float) -> Plan:
+        return Errands(plan.problem).move(a=(-0.4, y)).move(a=(0.4, y)).move(a=(1, 0)).plan()
+
+    stock = stock_of(past(-0.5))
+    [leg] = legs_of(whole_of(past(-0.5)))
+    q = whole_of(past(-0.5)).line.of("a")[leg.low : leg.high + 1]
+    for y, found in ((-0.53, []), (-0.47, [-0.47]), (-0.45, [-0.45]), (-0.46, [-0.45])):
+        other = past(y)
+        stock.add(other.segments, other.transitions)
+        assert [w.q[len(w.q) // 2][1] for w in stock.others(leg, q)] == pytest.approx(found), y
 
 
 def test_an_order_tells_who_does_what_when(tmp_path: Path) -> None:
@@ -122,6 +147,26 @@ def test_what_another_plan_did_better_is_taken_over(tmp_path: Path, monkeypatch:
     while not work.converged and work.steps < 400:
         work.step()
     assert work.cost == pytest.approx(1.01 * taut(0.1), rel=0.01)
+
+
+def test_a_shorter_way_that_is_free_counts_before_any_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs that lead nowhere do not lose it; what collides is none the better for being shorter."""
+    monkeypatch.setattr(local_search, "_BENT", 0.0)
+
+    def nowhere(scp: Optimiser) -> float:
+        scp.converged = True
+        return 0.0
+
+    monkeypatch.setattr(Optimiser, "step", nowhere)
+    plan = around(tmp_path)
+    through = Errands(plan.problem).move(a=(-0.4, -0.1)).move(a=(0.4, -0.1)).move(a=(1, 0)).plan()
+    for other, free in ((through, False), (below(plan), True)):
+        work = search(plan)
+        work.stock = stock_of(other)
+        while work._others() or work._trial:
+            work.step()
+        assert work.cost == pytest.approx(other.cost if free else plan.cost)
+        assert check_plan(plan_of(work)).ok
 
 
 def test_a_stock_may_grow_while_it_is_used(tmp_path: Path) -> None:

@@ -60,7 +60,10 @@ def held_mode(problem: Problem) -> Mode:
     return Mode(tuple(held if a.object == item.name else a for a in start.attachments), start.done)
 
 
-def test_robots_and_what_they_hold_against_the_world_and_each_other(problem: Problem) -> None:
+def test_robots_and_what_they_hold_against_the_world_and_each_other(
+    problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Distances are Drake's, to shapes without the padding that the planner's plants have."""
     rng = np.random.default_rng(0)
     collision = Collision(problem)
     nearness = Nearness(collision)
@@ -86,7 +89,8 @@ def test_robots_and_what_they_hold_against_the_world_and_each_other(problem: Pro
         theirs = drakes(world.scene, world.context, rows, REACH)
         assert sum(map(len, theirs)) > 100
         matches += [agree(a, b) for a, b in zip(ours, theirs, strict=True)]
-    pair, swapped = collision.pair(*names)
+    monkeypatch.setattr("mrtamp.collision.PADDING", 0.0)
+    pair, swapped = Collision(problem).pair(*names)
     assert not swapped
     ours = by_sample(
         nearness.between((names[0], names[1]), (states[names[0]], states[names[1]]), samples, arrangement, REACH), n

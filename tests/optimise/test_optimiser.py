@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from discs import HEIGHT, Errands, disc_problem, errand
+from arena import arena
+from discs import HEIGHT, RADIUS, Errands, disc_problem, errand
 from gantry import Script, gantry_problem, valid_plan
 from pydrake.math import RigidTransform
 from test_rows import optimiser
@@ -16,6 +17,7 @@ from test_rows import optimiser
 import mrtamp
 from mrtamp.check import Checker
 from mrtamp.check_report import Report, Side, Violation
+from mrtamp.collision import PADDING
 from mrtamp.optimise import Optimiser
 from mrtamp.optimise.nearness import Nearness
 from mrtamp.plan import Plan, plan_cost
@@ -48,6 +50,20 @@ def judged(scp: Optimiser) -> Report:
 
 def discs(folder: Path, **keys) -> Problem:
     return replace(disc_problem(folder), **{"subgoals": (), "statics": (), "goal": (), **keys})
+
+
+def test_robots_pass_each_other_more_closely_than_the_search_would_let_them(tmp_path: Path) -> None:
+    """Padding is for motion between samples of the search; here the judge says what is free."""
+    problem = arena(tmp_path, {"a": (-1, 0), "b": (1, 0)}, {"a": (1, 0), "b": (-1, 0)})
+    e = Errands(problem).move(b=(0.2, -0.6)).move(a=(-0.2, 0.5)).move(a=(1, 0)).move(b=(-1, 0))
+    scp = optimiser(e.plan())
+    run(scp, 60)
+    assert judged(scp).ok
+    [segment] = scp.segments()
+    t = np.linspace(0, 1, 50)[:, None]
+    a, b = (np.concatenate([x + t * (y - x) for x, y in pairwise(segment.q[r])]) for r in ("a", "b"))
+    gap = np.linalg.norm(a - b, axis=1).min() - 2 * RADIUS
+    assert 0 < gap < PADDING, "two paddings have no place in between"
 
 
 def test_what_is_far_from_being_worth_it_is_not_looked_at_closely(

@@ -15,7 +15,7 @@ def found(
     """Pairs of solids at samples of which there are four, or five, the last one at t in the first step."""
     P, n = len(sample), 4 + (t is not None)
     nothing = np.zeros(P, dtype=int)
-    near = Near(np.array(sample), np.array(distance), np.zeros((P, 6)), nothing, nothing, np.zeros(P))
+    near = Near(np.array(sample), np.array(distance), np.zeros((P, 6)), nothing, nothing)
     samples = Samples(np.arange(n) % 4, np.array([0.0, 0.0, 0.0, 0.0, t or 0.0])[:n], np.zeros(n, dtype=int))
     return _Found(samples, {}, near, np.array(touching or P * [False]), np.zeros(n))
 

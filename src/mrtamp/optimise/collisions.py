@@ -41,15 +41,13 @@ _PARTS = 24
 class CollisionRows:
     """Linearised distances: A (P, K * N + coordinates) of `distance` (P,), and the clearance `asked` (P,) of each.
 
-    Where robots stand, shapes count without `padding` (P,); `padded` (P,) are those of which more clearance may be
-    asked.  `clearance` is the least distance (K - 1, m + 1) at equal intervals along every step, as far as it is less
-    than what enters programs.
+    More clearance may be asked of those that are `padded` (P,).  `clearance` is the least distance (K - 1, m + 1) at
+    equal intervals along every step, as far as it is less than what enters programs.
     """
 
     A: sparse.csr_array
     distance: np.ndarray
     asked: np.ndarray
-    padding: np.ndarray
     padded: np.ndarray
     clearance: dict[Who, np.ndarray]
 
@@ -61,7 +59,7 @@ class CollisionRows:
     @property
     def depth(self) -> np.ndarray:
         """Penetration (P,) in m beyond what is allowed."""
-        return np.minimum(self.asked, 0) - self.padding - self.distance
+        return np.minimum(self.asked, 0) - self.distance
 
     def deepest(self, tolerance: float) -> float:
         """The largest penetration (m) beyond what is allowed and tolerated."""
@@ -75,11 +73,10 @@ class CollisionRows:
     def joined(self, other: CollisionRows) -> CollisionRows:
         """These rows and others."""
         A = sparse.csr_array(sparse.vstack([self.A, other.A]))
-        distance, asked, padding, padded = (
-            np.concatenate([getattr(x, name) for x in (self, other)])
-            for name in ("distance", "asked", "padding", "padded")
+        distance, asked, padded = (
+            np.concatenate([getattr(x, name) for x in (self, other)]) for name in ("distance", "asked", "padded")
         )
-        return CollisionRows(A, distance, asked, padding, padded, self.clearance)
+        return CollisionRows(A, distance, asked, padded, self.clearance)
 
     def stricter(self, by: float) -> CollisionRows:
         """The same with `by` (m) more clearance asked for."""
@@ -101,7 +98,7 @@ class _Found:
 
     @property
     def _claims(self) -> np.ndarray:
-        distance = self.near.distance + self.near.padding
+        distance = self.near.distance
         claims = np.maximum(_CONTENDS - distance, 0.0) + _FAINT * np.exp(-np.maximum(distance, 0.0) / _CONTENDS)
         return np.where(self.touching, 0.0, claims)
 
@@ -252,16 +249,16 @@ class Collisions:
         tolerated = bool(found) and self.tolerance > 0
         contention = _contention(found, len(base)) if tolerated else [np.zeros(0)] * len(found)
         blocks: list[sparse.csr_array] = [sparse.csr_array((0, q.size + len(arrangement.c)))]
-        parts: list[tuple[np.ndarray, ...]] = [(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))]
+        parts: list[tuple[np.ndarray, ...]] = [(np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))]
         for x, claimed in zip(found, contention, strict=True):
             asked = x.margin[x.near.sample]
             if tolerated:
                 asked = asked - _USED * self.tolerance * x.shares(claimed)
             blocks.append(self.gradient(line, x.samples, x.near, x.states, arrangement))
             asked = np.where(x.touching, _TOUCHING, asked)
-            parts.append((x.near.distance, asked, x.near.padding, ~x.touching))
-        distance, wanted, padding, padded = (np.concatenate(x) for x in zip(*parts, strict=True))
-        return CollisionRows(sparse.csr_array(sparse.vstack(blocks)), distance, wanted, padding, padded, clearance)
+            parts.append((x.near.distance, asked, ~x.touching))
+        distance, wanted, padded = (np.concatenate(x) for x in zip(*parts, strict=True))
+        return CollisionRows(sparse.csr_array(sparse.vstack(blocks)), distance, wanted, padded, clearance)
 
     def gradient(
         self, line: Polyline, samples: Samples, near: Near, states: Mapping[str, State], arrangement: Arrangement

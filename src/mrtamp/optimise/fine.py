@@ -105,15 +105,13 @@ class FineCheck:
         line: Polyline,
         q: np.ndarray,
         arrangement: Arrangement,
-        pinned: Mapping[str, np.ndarray],
         clearance: Mapping[Who, np.ndarray],
         between: bool = False,
     ) -> list[Violations]:
         """All samples in collision; with `between`, of the samples in between the others, and more of a close call.
 
-        Next to knots (K,) at which both of two robots are `pinned`, their shapes count without padding.  `clearance`
-        are distances (K - 1, m + 1) at equal intervals along every step: nothing that is further apart at both ends of
-        an interval than it moves in between is asked about.
+        `clearance` are distances (K - 1, m + 1) at equal intervals along every step: nothing that is further apart at
+        both ends of an interval than it moves in between is asked about.
         """
         travel = self._travel(line, q)
         samples = self._samples(line, travel, between)
@@ -144,14 +142,10 @@ class FineCheck:
             self.nearness.collision.counts.collision_checks += len(mine)
             at = [state.of(np.searchsorted(used, mine)) for used, state in (states[r] for r in who)]
             depth = np.zeros(len(samples))
-            if len(who) == 1:
-                depth[mine], suspects = self._world(line, who[0], at[0], samples[mine], arrangement)
-                if between and len(suspects) and not np.any(depth[mine] > self.tolerance):
-                    found = self._around(line, q, who[0], samples[mine[suspects]], arrangement, travel)
-                    out += [found] if len(found.samples) else []
-            else:
-                tight = pinned[who[0]] & pinned[who[1]]
-                depth[mine] = self._pair(who, (at[0], at[1]), samples[mine], arrangement, tight)
+            depth[mine], suspects = self._depths(line, who, at, samples[mine], arrangement)
+            if between and len(suspects) and not np.any(depth[mine] > self.tolerance):
+                found = self._around(line, q, who, samples[mine[suspects]], arrangement, travel)
+                out += [found] if len(found.samples) else []
             if self.tolerance > 0:
                 depth = depth[np.maximum.accumulate(np.where(stands, 0, np.arange(len(samples))))]
             total += depth
@@ -163,11 +157,16 @@ class FineCheck:
                 out.append(Violations(who, samples[hits], beyond[hits]))
         return out
 
-    def _world(
-        self, line: Polyline, robot: str, state: State, samples: Samples, arrangement: Arrangement
+    def _depths(
+        self, line: Polyline, who: Who, states: Sequence[State], samples: Samples, arrangement: Arrangement
     ) -> tuple[np.ndarray, np.ndarray]:
         """All penetrations together (S,) at every sample, and samples so close to one that those around them are worth
         a look."""
+        if len(who) == 2:
+            near = self.nearness.between((who[0], who[1]), (states[0], states[1]), samples, arrangement, _CLOSE)
+            close = _total(near, _CLOSE - near.distance, len(samples)) > self.tolerance
+            return _total(near, -near.distance, len(samples)), np.flatnonzero(close)
+        [robot], [state] = who, states
         near = self.nearness.world(robot, state, samples, arrangement, _CLOSE)
         touching = self.nearness.touching(robot, contact_of(line.stretches, robot, samples), near)
         lifted = touching & (near.distance >= -CONTACT_DEPTH)
@@ -179,7 +178,7 @@ class FineCheck:
         self,
         line: Polyline,
         q: np.ndarray,
-        robot: str,
+        who: Who,
         samples: Samples,
         arrangement: Arrangement,
         travel: Mapping[str, np.ndarray],
@@ -191,25 +190,10 @@ class FineCheck:
         repeat = len(_AROUND)
         more = Samples(np.repeat(samples.lo, repeat), t, np.repeat(samples.segment, repeat))[inside]
         self.nearness.collision.counts.collision_checks += len(more)
-        state = self.nearness.state(robot, q[:, line.columns[robot]], more, arrangement.modes)
-        beyond = self._world(line, robot, state, more, arrangement)[0] - self.tolerance
+        states = [self.nearness.state(r, q[:, line.columns[r]], more, arrangement.modes) for r in who]
+        beyond = self._depths(line, who, states, more, arrangement)[0] - self.tolerance
         hits = np.flatnonzero(beyond > 0)
-        return Violations((robot,), more[hits], beyond[hits])
-
-    def _pair(
-        self,
-        who: Who,
-        states: tuple[State, State],
-        samples: Samples,
-        arrangement: Arrangement,
-        tight: np.ndarray,
-    ) -> np.ndarray:
-        """All penetrations together (S,) at every sample."""
-        near = self.nearness.between((who[0], who[1]), states, samples, arrangement, 0.0)
-        lo, t = samples.lo, samples.t
-        exact = (t == 0) | (t == 1) | tight[lo] | tight[np.minimum(lo + 1, len(tight) - 1)]
-        bare = exact[near.sample] | (self.tolerance > 0)
-        return _total(near, -near.distance - np.where(bare, near.padding, 0.0), len(samples))
+        return Violations(who, more[hits], beyond[hits])
 
 
 def _total(near: Near, depth: np.ndarray, n: int) -> np.ndarray:

@@ -22,6 +22,10 @@ _SAME_ENDS = 0.2
 """How far (rad or m, any joint) the ends of two ways may be from each other if one can take the place of the other."""
 _ALIKE = 0.08
 """Distance (rad or m) up to which two ways are the same everywhere."""
+_SHORTER = 2e-3
+"""Length (rad or m) by which a way has to be shorter than one that is the same everywhere to be better."""
+_BESIDE = 1e-3
+"""Share of a step from a knot within which it gets no other."""
 _POINTS = 40
 """At so many points, evenly along both, ways are compared."""
 _KEPT = 12
@@ -99,20 +103,26 @@ class Way:
         at = np.linspace(0.0, along[-1], _POINTS)
         return np.column_stack([np.interp(at, along, column) for column in q.T])
 
-    def instead_of(self, q: np.ndarray, clock: np.ndarray | None = None) -> np.ndarray:
-        """Its configurations (K, n) in place of those of a way q (K, n), whose ends they get.
+    def instead_of(self, q: np.ndarray, clock: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters u (M',) of a way q (K, n) that include its own knots, and the configurations (M', n) that take the
+        place of those there: all of this way's, between the ends of the other.
 
         They advance as those did, or are reached when this way's plan reached them, by the `clock` (K,).
         """
         if clock is None:
             at, of = _along(q), _along(self.q)
-            at = at * (of[-1] / max(at[-1], 1e-12))
+            of = of * (at[-1] / max(of[-1], 1e-12))
         else:
             at, of = clock, self.clock
-        fresh = np.column_stack([np.interp(at, of, column) for column in self.q.T])
+        knots = np.arange(float(len(q)))
+        inner = np.interp(of, at, knots)
+        inner = inner[np.abs(inner - np.round(inner)) > _BESIDE]
+        u = np.union1d(knots, inner)
+        when = np.interp(u, knots, at)
+        fresh = np.column_stack([np.interp(when, of, column) for column in self.q.T])
         fresh[[0, -1]] = self.q[[0, -1]]
-        u = np.linspace(0.0, 1.0, len(q))[:, None]
-        return np.asarray(fresh + (1 - u) * (q[0] - fresh[0]) + u * (q[-1] - fresh[-1]))
+        share = (u / (len(q) - 1))[:, None]
+        return u, np.asarray(fresh + (1 - share) * (q[0] - fresh[0]) + share * (q[-1] - fresh[-1]))
 
 
 class Stock:
@@ -130,15 +140,22 @@ class Stock:
             part = slice(leg.low, leg.high + 1)
             q = whole.line.of(leg.robot)[part]
             known = self._ways.setdefault(leg.name, [])
-            if leg.length > _ALIKE and not any(_near_ends(w.q, q) and w.beside(q) < _ALIKE for w in known):
-                known.append(Way(q.copy(), clock[part], order))
-                del known[:-_KEPT]
+            if leg.length <= _ALIKE:
+                continue
+            alike = [w for w in known if _near_ends(w.q, q) and w.beside(q) < _ALIKE]
+            if all(leg.length < w.length - _SHORTER for w in alike):
+                others = [w for w in known if w not in alike]
+                known[:] = [*others[1 - _KEPT :], Way(q.copy(), clock[part], order)]
 
     def others(self, leg: Leg, q: np.ndarray) -> list[Way]:
-        """Ways that could take the place of that of a leg, q (K, n), and are different from it."""
+        """Ways that could take the place of that of a leg, q (K, n), and are different from it, or shorter."""
         if leg.length <= _ALIKE:
             return []
-        return [w for w in self._ways.get(leg.name, []) if _near_ends(w.q, q) and w.beside(q) >= _ALIKE]
+        return [
+            w
+            for w in self._ways.get(leg.name, [])
+            if _near_ends(w.q, q) and (w.length < leg.length - _SHORTER or w.beside(q) >= _ALIKE)
+        ]
 
 
 def order_of(transitions: Sequence[Transition]) -> tuple:

@@ -195,17 +195,22 @@ class LocalSearch:
             return None
         line = self._whole.line
         others = self._others() if self.rng.uniform() >= _BENT else []
-        robot, low, high, way = self._from_stock(others) if others else self._bent()
+        robot, low, u, way = self._from_stock(others) if others else self._bent()
+        whole = self._whole.at(np.concatenate([np.arange(low), u, np.arange(np.ceil(u[-1]) + 1, line.knots)]))
+        line, high = whole.line, low + len(u) - 1
         q = line.q.copy()
         q[low : high + 1, line.columns[robot]] = way
-        along = self._whole.line.along()
-        bounds, margin = self._whole.bounds(), _AROUND * self._reach
+        along = line.along()
+        bounds, margin = whole.bounds(), _AROUND * self._reach
         first = int(np.searchsorted(along, along[low] - margin))
         last = int(np.searchsorted(along, along[high] + margin))
-        piece = self._whole.piece(int(bounds[bounds <= first][-1]), int(bounds[bounds >= min(last, line.knots - 1)][0]))
+        piece = whole.piece(int(bounds[bounds <= first][-1]), int(bounds[bounds >= min(last, line.knots - 1)][0]))
         transitions = piece.transitions
         base = plan_cost(piece.segments(line.q), list(transitions), self.problem.cost)
         scp = self._optimiser(piece.segments(q), transitions, fixed_end=not piece.is_last, to_beat=base)
+        if others:
+            # Programs might not find back to what was free of collision and shorter.
+            scp.take_as_given()
         return _Trial(piece, scp, base, [], [])
 
     def _others(self) -> list[tuple[Leg, Way]]:
@@ -218,8 +223,9 @@ class LocalSearch:
             if (way, round(leg.length, _SAME)) not in self._tried
         ]
 
-    def _from_stock(self, others: Sequence[tuple[Leg, Way]]) -> tuple[str, int, int, np.ndarray]:
-        """Who goes another plan's way, between which knots, and the way (M, n); shorter ones more often."""
+    def _from_stock(self, others: Sequence[tuple[Leg, Way]]) -> tuple[str, int, np.ndarray, np.ndarray]:
+        """Who goes another plan's way, from which knot on, at which parameters (M,) of the plan's knots, and the way
+        (M, n); shorter ones more often."""
         shorter = np.array([leg.length - way.length for leg, way in others]) / _SHORTER
         weights = np.exp(np.clip(shorter, *_FAVOUR))
         leg, way = others[int(self.rng.choice(len(weights), p=weights / weights.sum()))]
@@ -228,17 +234,18 @@ class LocalSearch:
         at_its_time = way.order == order_of(self.transitions) and self.rng.uniform() < 0.5
         clock = self._whole.clock()[part] if at_its_time else None
         chain = self.nearness.worlds[leg.robot].chain
-        fresh = way.instead_of(self._whole.line.of(leg.robot)[part], clock)
-        return leg.robot, leg.low, leg.high, np.clip(fresh, chain.lower, chain.upper)
+        u, fresh = way.instead_of(self._whole.line.of(leg.robot)[part], clock)
+        return leg.robot, leg.low, leg.low + u, np.clip(fresh, chain.lower, chain.upper)
 
-    def _bent(self) -> tuple[str, int, int, np.ndarray]:
-        """Whose way is bent at random, between which knots, and the way (M, n); ways with more to spare more often."""
+    def _bent(self) -> tuple[str, int, np.ndarray, np.ndarray]:
+        """Whose way is bent at random, from which knot on, at which parameters (M,) of the plan's knots, and the way
+        (M, n); ways with more to spare more often."""
         weights = np.array([x.spare + _STRAY for x in self._legs])
         leg = self._legs[int(self.rng.choice(len(weights), p=weights / weights.sum()))]
         along = self._whole.line.along()
         low, high = self._part(along, leg)
         way = self._whole.line.of(leg.robot)[low : high + 1]
-        return leg.robot, low, high, self._bend(leg.robot, way, along[low : high + 1])
+        return leg.robot, low, np.arange(low, high + 1), self._bend(leg.robot, way, along[low : high + 1])
 
     def _bend(self, robot: str, way: np.ndarray, along: np.ndarray) -> np.ndarray:
         """A way (M, n) that leads elsewhere between its ends; it is as long as `along` (M,) says."""

@@ -65,7 +65,7 @@ class Samples:
 class Near:
     """Pairs of solids near each other: at `sample` (P,), `distance` (P,), wrench (P, 6), carriers `a`, `b` (P,).
 
-    `padding` (P,) is what the two shapes are larger in the plant than they are.
+    Distances are those of the shapes as they are, without padding.
     """
 
     sample: np.ndarray
@@ -73,7 +73,6 @@ class Near:
     wrench: np.ndarray
     a: np.ndarray
     b: np.ndarray
-    padding: np.ndarray
 
     def of(self, index: np.ndarray) -> Near:
         """Some of the pairs."""
@@ -140,7 +139,7 @@ def _ask(scene: Scene, context: Context, known: _Plant, rows: np.ndarray, reach:
     """Drake's nearest pairs with shapes that only it knows, at every row of the samples numbered `kept` (N,)."""
     plant, foreign, carrier, grown = scene.plant, known.shapes.foreign, known.carrier, scene.grown
     port = plant.get_geometry_query_input_port()
-    sample, distance, normal, point, a, b, padding = [], [], [], [], [], [], []
+    sample, distance, normal, point, a, b = [], [], [], [], [], []
     last, found = None, []
     for i, row in zip(kept.tolist(), rows, strict=True):
         if last is None or not np.array_equal(row, last):
@@ -148,28 +147,26 @@ def _ask(scene: Scene, context: Context, known: _Plant, rows: np.ndarray, reach:
             query = port.Eval(context)
             found = [
                 (
-                    p.distance,
+                    p.distance + grown.get(p.id_A, 0.0) + grown.get(p.id_B, 0.0),
                     p.nhat_BA_W,
                     query.GetPoseInWorld(p.id_A).multiply(p.p_ACa),
                     carrier[p.id_A],
                     carrier[p.id_B],
-                    grown.get(p.id_A, 0.0) + grown.get(p.id_B, 0.0),
                 )
                 for p in closest_points(query, reach, foreign)
             ]
             last = row
-        for d, n, p, x, y, extra in found:
+        for d, n, p, x, y in found:
             sample.append(i)
             distance.append(d)
             normal.append(n)
             point.append(p)
             a.append(x)
             b.append(y)
-            padding.append(extra)
     n, p = np.array(normal).reshape(-1, 3), np.array(point).reshape(-1, 3)
     wrench = np.concatenate([cross(p, n), n], axis=1)
     i, j, k = (np.array(x, dtype=int) for x in (sample, a, b))
-    return Near(i, np.array(distance), wrench, j, k, np.array(padding))
+    return Near(i, np.array(distance), wrench, j, k)
 
 
 def closest_points(query: QueryObject, reach: float, of: Set[GeometryId]) -> list[SignedDistancePair]:
@@ -219,13 +216,11 @@ def _nowhere(n: int) -> Poses:
 
 @dataclass(frozen=True, eq=False)
 class _Plant:
-    """One of the planner's plants: its shapes, and what carries each of its geometries, by id and by index (G,);
-    by how much (m) each is padded."""
+    """One of the planner's plants: its shapes, and what carries each of its geometries, by id and by index (G,)."""
 
     shapes: Shapes
     carrier: dict
     number: np.ndarray
-    grown: np.ndarray
 
     def near(
         self, n: int, robots: Mapping[str, State], free: Mapping[str, Poses], reach: float
@@ -234,8 +229,7 @@ class _Plant:
         poses = self.shapes.placed(n, {r: (x.R, x.p) for r, x in robots.items()}, free)
         found = self.shapes.near(poses, reach)
         wrench = np.concatenate([cross(found.witness, found.normal), found.normal], axis=1)
-        padding = self.grown[found.a] + self.grown[found.b]
-        near = Near(found.sample, found.distance, wrench, self.number[found.a], self.number[found.b], padding)
+        near = Near(found.sample, found.distance, wrench, self.number[found.a], self.number[found.b])
         return near, self.shapes.unsettled(poses, reach)
 
 
@@ -254,8 +248,7 @@ class Nearness:
             carrier = self.carriers.of_geometries(scene)
             shapes = Shapes(scene, {r: self.worlds[r].chain.bodies for r in scene.robots})
             number = np.array([carrier[g] for g in shapes.ids], dtype=int)
-            grown = np.array([scene.grown.get(g, 0.0) for g in shapes.ids])
-            self._plants[id(scene)] = _Plant(shapes, carrier, number, grown)
+            self._plants[id(scene)] = _Plant(shapes, carrier, number)
         return self._plants[id(scene)]
 
     def _chain(self, robot: str, held: Attachment | None) -> Chain:
@@ -447,7 +440,4 @@ class Nearness:
 
 
 def _joined(parts: Sequence[Near]) -> Near:
-    sample, distance, wrench, a, b, padding = (
-        np.concatenate(x) for x in zip(*(vars(p).values() for p in parts), strict=True)
-    )
-    return Near(sample, distance, wrench, a, b, padding)
+    return Near(*(np.concatenate(x) for x in zip(*(vars(p).values() for p in parts), strict=True)))

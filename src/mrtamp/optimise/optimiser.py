@@ -189,6 +189,15 @@ class Optimiser:
         x = min(self._best, self._now, key=lambda x: x.cost)
         return x.line.segments(x.q, x.arrangement.modes), x.arrangement.transitions
 
+    def take_as_given(self) -> None:
+        """Count what was given, a draft, as free of collision if it is; programs only have to make it cheaper then."""
+        given = self._iterate(self._sure.line, self._sure.q, self._sure.arrangement)
+        if np.isfinite(self._best.cost) or given.cost >= self.to_beat:
+            return
+        clearance = self.collisions.rows(given.line, given.q, given.arrangement).clearance
+        if not self._violations(given, clearance):
+            self._best = given
+
     def confirm(self) -> None:
         """The judge accepted the best iterate: `tighten` will not go back behind it."""
         self._sure = self._best
@@ -402,7 +411,7 @@ class Optimiser:
 
         `thoroughly`: even where the first look has found some.
         """
-        where = x.line, x.q, x.arrangement, self._pinned, clearance
+        where = x.line, x.q, x.arrangement, clearance
         found = self.fine.violations(*where)
         if x.cost >= self._best.cost - _EPS or (found and not thoroughly):
             return found

@@ -24,6 +24,10 @@ class Whole:
         """The plan's segments."""
         return self.line.segments(self.line.q, self.modes)
 
+    def at(self, u: np.ndarray) -> Whole:
+        """The same plan with knots at parameters u (K',), ascending, which include all it has."""
+        return Whole(self.line.at(u), self.modes, self.transitions)
+
     def clock(self) -> np.ndarray:
         """When every knot (K,) is reached, ascending: transition k, counted from 1, happens at k, the plan ends at one
         more than there are; in between time goes on as the robot that moves most."""

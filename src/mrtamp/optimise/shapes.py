@@ -1,7 +1,8 @@
 """The collision geometries of one of the planner's plants as rounded boxes, for distances of many samples at once.
 
-Shapes, poses in their bodies, padding and filters are read out of Drake's SceneGraph: there is no second description.
-What is no rounded box (meshes, cylinders, ...) is bounded by spheres here and left to Drake where those come near.
+Shapes, poses in their bodies and filters are read out of Drake's SceneGraph: there is no second description.  Padding
+is left out.  What is no rounded box (meshes, cylinders, ...) is bounded by spheres here and left to Drake where those
+come near.
 """
 
 from __future__ import annotations
@@ -176,16 +177,17 @@ def _rounded(
     scene: Scene, inspector: SceneGraphInspector, g: GeometryId
 ) -> tuple[np.ndarray, tuple[np.ndarray, float, float, bool]]:
     """Pose (4, 4) of a geometry in its body; half size (3,) and radius of a rounded box, radius around its centre, and
-    whether the geometry is that box.  Otherwise it is somewhere in it, unless it has no end.
+    whether the geometry, without padding, is that box.  Otherwise it is somewhere in it, unless it has no end.
     """
     X = inspector.GetPoseInFrame(g).GetAsMatrix4()
     shape = inspector.GetShape(g)
+    padding = scene.grown.get(g, 0.0)
     if isinstance(shape, Sphere):
-        half, radius = np.zeros(3), shape.radius()
+        half, radius = np.zeros(3), shape.radius() - padding
     elif isinstance(shape, Capsule):
-        half, radius = np.array([0.0, 0.0, shape.length() / 2]), shape.radius()
+        half, radius = np.array([0.0, 0.0, shape.length() / 2]), shape.radius() - padding
     elif isinstance(shape, Box):
-        half, radius = np.asarray(shape.size()) / 2, 0.0
+        half, radius = np.asarray(shape.size()) / 2 - padding, 0.0
     elif isinstance(shape, HalfSpace):
         return X, (np.zeros(3), 0.0, np.inf, False)
     elif isinstance(shape, Cylinder):

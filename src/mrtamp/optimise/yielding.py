@@ -357,9 +357,9 @@ def _attributed(
 
 
 def _deepest(near: Near, n: int, among: np.ndarray | slice = slice(None)) -> np.ndarray:
-    """Deepest penetration (n,) at each sample, of shapes without padding, among some of the pairs."""
+    """Deepest penetration (n,) at each sample, among some of the pairs."""
     out = np.zeros(n)
-    np.maximum.at(out, near.sample[among], -(near.distance + near.padding)[among])
+    np.maximum.at(out, near.sample[among], -near.distance[among])
     return out
 
 
