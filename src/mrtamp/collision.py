@@ -305,9 +305,8 @@ class RobotPair:
 
     def _tolerated(self, query: QueryObject) -> bool:
         """Whether the shapes as they are penetrate no more than is tolerated."""
-        grown = self.scene.grown
         found = sorted(query.ComputePointPairPenetration(), key=lambda p: -p.depth)
-        padding = [grown.get(p.id_A, 0.0) + grown.get(p.id_B, 0.0) for p in found]
+        padding = [self.scene.padding(p.id_A, p.id_B) for p in found]
         if sum(max(p.depth - extra, 0.0) for p, extra in zip(found, padding, strict=True)) <= self.tolerance:
             return True
         return within(self.tolerance, (depth_of(query, p) - extra for p, extra in zip(found, padding, strict=True)))

@@ -117,13 +117,16 @@ class Entry:
         Where there is a choice of ways, and in local search, later rounds go on to the end.
         """
         if self.rounds and self.patience.same_ways and isinstance(self.optimiser, Optimiser):
-            recent = self.trail[-_LATELY:]
-            return len(recent) == _LATELY and recent[0] - min(recent) < _CREEP * recent[-1]
+            return self._gained_less(_CREEP, _LATELY)
         # What has not been checked has to be good by then to go on.
         lately = self.patience.lately * (2 if self.unchecked else 1)
-        trail = self.trail[-lately:]
         clean = self.optimiser is not None and self.optimiser.cost <= (1 + _CRAWL) * self.outlook
-        return self.rounds == 0 and clean and len(trail) == lately and trail[0] - min(trail) < _CRAWL * trail[-1]
+        return self.rounds == 0 and clean and self._gained_less(_CRAWL, lately)
+
+    def _gained_less(self, share: float, programs: int) -> bool:
+        """Whether there were so many programs in this round, and the last of them gained less than that share."""
+        trail = self.trail[-programs:]
+        return len(trail) == programs and trail[0] - min(trail) < share * trail[-1]
 
     @property
     def over(self) -> bool:

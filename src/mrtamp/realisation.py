@@ -270,7 +270,8 @@ class Realisation:
 
     def _conflicts(self, proposal: Proposal) -> bool:
         """Whether some of its ways conflicted in a draft before."""
-        return any(ways <= set(proposal.ways) for ways in self._crowded)
+        own = set(proposal.ways)
+        return any(ways <= own for ways in self._crowded)
 
     @staticmethod
     def _blamed(proposal: Proposal, transitions: Sequence[Transition], draft: Draft) -> Mapping[Way, float]:

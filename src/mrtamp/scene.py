@@ -84,6 +84,10 @@ class Scene:
         root = self.diagram.CreateDefaultContext()
         return root, self.plant.GetMyMutableContextFromRoot(root)
 
+    def padding(self, a: GeometryId, b: GeometryId) -> float:
+        """By how much (m) two collision geometries are padded together."""
+        return self.grown.get(a, 0.0) + self.grown.get(b, 0.0)
+
     def write_pose(self, q: np.ndarray, body: str, X_WF: np.ndarray) -> None:
         """Write the 4x4 world pose of a free body into the position vector q in place."""
         k = self.floating[body]

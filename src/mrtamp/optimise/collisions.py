@@ -10,7 +10,7 @@ import numpy as np
 from scipy import sparse
 
 from mrtamp.optimise.choices import Arrangement
-from mrtamp.optimise.fine import Violations, Who, contact_of, knot_samples
+from mrtamp.optimise.fine import Violations, Who, knot_samples, near_to
 from mrtamp.optimise.nearness import Near, Nearness, Samples, State
 from mrtamp.optimise.polyline import Polyline
 
@@ -233,17 +233,11 @@ class Collisions:
                     samples = base.joined(extra)
                     more = {r: ask.state(r, knots[r], extra, arrangement.modes) for r in who}
                     states = {r: common[r].joined(more[r]) for r in who}
-                if other is None:
-                    near = ask.world(robot, states[robot], samples, arrangement, _NEAR)
-                else:
-                    pair = (states[other], states[robot])
-                    near = ask.between((other, robot), pair, samples, arrangement, _NEAR)
+                near, touching = near_to(ask, line, who, [states[r] for r in who], samples, arrangement, _NEAR)
                 clearance[who] = self._clearance(line, base, near)
                 if self.reach < _NEAR:
-                    near = near.of(near.distance < self.reach)
-                touching = np.zeros(len(near.distance), dtype=bool)
-                if other is None:
-                    touching = ask.touching(robot, contact_of(line.stretches, robot, samples), near)
+                    close = near.distance < self.reach
+                    near, touching = near.of(close), touching[close]
                 if len(near.distance):
                     found.append(_Found(samples, states, near, touching, margin))
         tolerated = bool(found) and self.tolerance > 0

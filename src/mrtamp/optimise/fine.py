@@ -35,7 +35,26 @@ class Violations:
     depth: np.ndarray
 
 
-def contact_of(stretches: Sequence[Stretch], robot: str, samples: Samples) -> np.ndarray:
+def near_to(
+    nearness: Nearness,
+    line: Polyline,
+    who: Who,
+    states: Sequence[State],
+    samples: Samples,
+    arrangement: Arrangement,
+    reach: float,
+) -> tuple[Near, np.ndarray]:
+    """What is within `reach` (m) of one robot, or between two, in these states; and which of the pairs (P,) may touch,
+    since an object is lifted off or put on something."""
+    if len(who) == 2:
+        near = nearness.between((who[0], who[1]), (states[0], states[1]), samples, arrangement, reach)
+        return near, np.zeros(len(near.distance), dtype=bool)
+    [robot], [state] = who, states
+    near = nearness.world(robot, state, samples, arrangement, reach)
+    return near, nearness.touching(robot, _contact_of(line.stretches, robot, samples), near)
+
+
+def _contact_of(stretches: Sequence[Stretch], robot: str, samples: Samples) -> np.ndarray:
     """What the robot's load may touch at every sample (S,): the name of a thing, or ''."""
     out = np.full(len(samples), "", dtype=object)
     time = samples.lo + samples.t
@@ -162,13 +181,7 @@ class FineCheck:
     ) -> tuple[np.ndarray, np.ndarray]:
         """All penetrations together (S,) at every sample, and samples so close to one that those around them are worth
         a look."""
-        if len(who) == 2:
-            near = self.nearness.between((who[0], who[1]), (states[0], states[1]), samples, arrangement, _CLOSE)
-            close = _total(near, _CLOSE - near.distance, len(samples)) > self.tolerance
-            return _total(near, -near.distance, len(samples)), np.flatnonzero(close)
-        [robot], [state] = who, states
-        near = self.nearness.world(robot, state, samples, arrangement, _CLOSE)
-        touching = self.nearness.touching(robot, contact_of(line.stretches, robot, samples), near)
+        near, touching = near_to(self.nearness, line, who, states, samples, arrangement, _CLOSE)
         lifted = touching & (near.distance >= -CONTACT_DEPTH)
         depth = np.where(lifted, 0.0, -near.distance)
         close = _total(near, np.where(touching, depth, depth + _CLOSE), len(samples)) > self.tolerance

@@ -22,7 +22,7 @@ _SAME_ENDS = 0.2
 """How far (rad or m, any joint) the ends of two ways may be from each other if one can take the place of the other."""
 _ALIKE = 0.08
 """Distance (rad or m) up to which two ways are the same everywhere."""
-_SHORTER = 2e-3
+_SAVED = 2e-3
 """Length (rad or m) by which a way has to be shorter than one that is the same everywhere to be better."""
 _BESIDE = 1e-3
 """Share of a step from a knot within which it gets no other."""
@@ -143,7 +143,7 @@ class Stock:
             if leg.length <= _ALIKE:
                 continue
             alike = [w for w in known if _near_ends(w.q, q) and w.beside(q) < _ALIKE]
-            if all(leg.length < w.length - _SHORTER for w in alike):
+            if all(leg.length < w.length - _SAVED for w in alike):
                 others = [w for w in known if w not in alike]
                 known[:] = [*others[1 - _KEPT :], Way(q.copy(), clock[part], order)]
 
@@ -154,7 +154,7 @@ class Stock:
         return [
             w
             for w in self._ways.get(leg.name, [])
-            if _near_ends(w.q, q) and (w.length < leg.length - _SHORTER or w.beside(q) >= _ALIKE)
+            if _near_ends(w.q, q) and (w.length < leg.length - _SAVED or w.beside(q) >= _ALIKE)
         ]
 
 

@@ -196,7 +196,7 @@ class LocalSearch:
         line = self._whole.line
         others = self._others() if self.rng.uniform() >= _BENT else []
         robot, low, u, way = self._from_stock(others) if others else self._bent()
-        whole = self._whole.at(np.concatenate([np.arange(low), u, np.arange(np.ceil(u[-1]) + 1, line.knots)]))
+        whole = self._whole.at(np.concatenate([np.arange(low), u, np.arange(u[-1] + 1, line.knots)]))
         line, high = whole.line, low + len(u) - 1
         q = line.q.copy()
         q[low : high + 1, line.columns[robot]] = way

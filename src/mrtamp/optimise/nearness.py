@@ -137,7 +137,7 @@ class Carriers:
 
 def _ask(scene: Scene, context: Context, known: _Plant, rows: np.ndarray, reach: float, kept: np.ndarray) -> Near:
     """Drake's nearest pairs with shapes that only it knows, at every row of the samples numbered `kept` (N,)."""
-    plant, foreign, carrier, grown = scene.plant, known.shapes.foreign, known.carrier, scene.grown
+    plant, foreign, carrier = scene.plant, known.shapes.foreign, known.carrier
     port = plant.get_geometry_query_input_port()
     sample, distance, normal, point, a, b = [], [], [], [], [], []
     last, found = None, []
@@ -147,7 +147,7 @@ def _ask(scene: Scene, context: Context, known: _Plant, rows: np.ndarray, reach:
             query = port.Eval(context)
             found = [
                 (
-                    p.distance + grown.get(p.id_A, 0.0) + grown.get(p.id_B, 0.0),
+                    p.distance + scene.padding(p.id_A, p.id_B),
                     p.nhat_BA_W,
                     query.GetPoseInWorld(p.id_A).multiply(p.p_ACa),
                     carrier[p.id_A],

@@ -191,8 +191,10 @@ class Optimiser:
 
     def take_as_given(self) -> None:
         """Count what was given, a draft, as free of collision if it is; programs only have to make it cheaper then."""
-        given = self._iterate(self._sure.line, self._sure.q, self._sure.arrangement)
-        if np.isfinite(self._best.cost) or given.cost >= self.to_beat:
+        if np.isfinite(self._best.cost):
+            return
+        given = self._priced(self._best)
+        if given.cost >= self.to_beat:
             return
         clearance = self.collisions.rows(given.line, given.q, given.arrangement).clearance
         if not self._violations(given, clearance):
@@ -207,9 +209,7 @@ class Optimiser:
 
         While a draft has none, it is what was given.
         """
-        refused = self._best
-        if np.isinf(refused.cost):
-            refused = self._iterate(refused.line, refused.q, refused.arrangement)
+        refused = self._priced(self._best)
         self._best, self.converged, self._stalls = self._sure, False, 0
         self._trail.clear()
         self.trust = max(self.trust, 4 * _SMALLEST)
@@ -484,6 +484,10 @@ class Optimiser:
             return Iterate(line, q, arrangement, self._changes)
         motion = self.weights.makespan * lengths.max(axis=0).sum() + self.weights.path_length * lengths.sum()
         return Iterate(line, q, arrangement, float(motion) + self._changes)
+
+    def _priced(self, x: Iterate) -> Iterate:
+        """An iterate with what it costs, also where it does not count since it is a draft."""
+        return self._iterate(x.line, x.q, x.arrangement) if np.isinf(x.cost) else x
 
     def _clipped(self, q: np.ndarray) -> np.ndarray:
         return np.clip(q, *self._limits)
