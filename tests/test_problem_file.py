@@ -358,6 +358,20 @@ def test_round_trip_through_json() -> None:
         assert mine.X_BS.IsNearlyEqualTo(other.X_BS, 1e-12)
 
 
+@pytest.mark.parametrize("thickness", [1.2345662644e-3, 3e-10, 4.5e-311])
+def test_default_grasps_of_thin_objects_survive_the_round_trip(thickness: float) -> None:
+    """Depths are rounded for the reader, but the most is never less than the least."""
+    data = example_data()
+    [red] = [o for o in data["objects"] if o["name"] == "red"]
+    red["shape"], red["grasps"] = {"box": [0.05, 0.05, thickness]}, [{"antipodal": {"approach": ["-z"]}}]
+    problem = problem_from_dict(data)
+    for grasp in problem.object("red").grasps:
+        assert isinstance(grasp, AntipodalGrasps)
+        assert 0.0 <= grasp.depth[0] <= grasp.depth[1] <= thickness
+    again = problem_to_dict(problem)
+    assert_same(again, problem_to_dict(problem_from_dict(again)))
+
+
 def test_dict_stands_alone(
     folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -131,7 +131,7 @@ def _default_depth(thickness: float) -> tuple[float, float]:
     """Deep enough to hold, shallow enough that neither the palm nor what is behind the object is touched."""
     deepest = min(MAX_DEPTH, thickness - TIP_CLEARANCE)
     shallowest = min(MIN_DEPTH, thickness / 2)
-    return shallowest, round(max(shallowest, deepest), 9)
+    return shallowest, max(shallowest, round(deepest, 9))
 
 
 def _axis(direction: str) -> int:
