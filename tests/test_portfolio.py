@@ -12,12 +12,14 @@ from arena import XY, arena, visit, wall
 from discs import Errands
 
 from mrtamp.check import check_plan
+from mrtamp.optimise import Optimiser
 from mrtamp.options import Skeleton
 from mrtamp.plan import Plan
 from mrtamp.planner import Options, Planner
-from mrtamp.portfolio import _PATIENCE, SIZE, Portfolio
+from mrtamp.portfolio import _PATIENCE, _PLENTY, SIZE, Portfolio, Sketch
 from mrtamp.portfolio_entry import Entry
 from mrtamp.skeleton_guidance import Proposal
+from mrtamp.transitions.ways import Way
 
 STARTS: Mapping[str, XY] = {"a": (-1, 1), "b": (-1, -1)}
 
@@ -73,7 +75,7 @@ def test_a_plan_is_taken_once_and_only_so_many_are_kept(tmp_path: Path) -> None:
 def test_the_incumbent_has_its_second_round_before_others_have_their_trial(tmp_path: Path) -> None:
     planner = planner_for(tmp_path)
     portfolio, best = planner.portfolio, roundabout(planner, 0.6)
-    portfolio.add_drafts([(best.cost, portfolio.yielding.time(best.segments, best.transitions))])
+    portfolio.add_drafts([Sketch(best.cost, portfolio.yielding.time(best.segments, best.transitions))])
     [entry] = portfolio._entries
     best = entry.plan
     while not entry.done:
@@ -90,7 +92,7 @@ def test_the_incumbent_has_its_second_round_before_others_have_their_trial(tmp_p
 def test_an_incumbent_far_above_what_skeletons_promise_is_challenged_before_its_second_round(tmp_path: Path) -> None:
     planner = planner_for(tmp_path)
     portfolio, best = planner.portfolio, roundabout(planner, 0.6)
-    portfolio.add_drafts([(best.cost, portfolio.yielding.time(best.segments, best.transitions))])
+    portfolio.add_drafts([Sketch(best.cost, portfolio.yielding.time(best.segments, best.transitions))])
     [entry] = portfolio._entries
 
     def poor(times: float) -> bool:
@@ -115,7 +117,7 @@ def test_drafts_begin_with_the_most_promising_whatever_they_seem_to_cost(tmp_pat
     portfolio = planner.portfolio
     plans = [roundabout(planner, height) for height in (0.2, 0.9, 0.5)]
     assert plans[1].cost < plans[0].cost
-    portfolio.add_drafts([(1.0, portfolio.yielding.time(p.segments, p.transitions)) for p in plans])
+    portfolio.add_drafts([Sketch(1.0, portfolio.yielding.time(p.segments, p.transitions)) for p in plans])
     first = portfolio._entries[-1]
     assert portfolio._choose(10 * plans[0].cost) is first
     assert first.plan.cost == max(e.plan.cost for e in portfolio._entries)
@@ -127,8 +129,8 @@ def test_drafts_that_are_free_count_as_plans_and_make_room_for_themselves(tmp_pa
     for k in range(SIZE):
         assert portfolio.add(roundabout(planner, 0.9 - 0.2 * k))
     plans = [roundabout(planner, 0.85 - 0.2 * k) for k in range(3)]
-    drafts = [(p.cost, portfolio.yielding.time(p.segments, p.transitions)) for p in plans]
-    assert all(draft.conflict == 0.0 for _, draft in drafts), "both at once, on opposite sides"
+    drafts = [Sketch(p.cost, portfolio.yielding.time(p.segments, p.transitions)) for p in plans]
+    assert all(x.draft.conflict == 0.0 for x in drafts), "both at once, on opposite sides"
     assert portfolio.add_drafts(drafts) == 3
     assert portfolio.add_drafts(drafts) == 0, "they are known"
     assert len(portfolio._entries) == SIZE
@@ -235,6 +237,15 @@ def test_small_gains_wait_for_the_judge_until_several_programs_have_passed(tmp_p
     assert due == [True, False, *_PATIENCE * [False], True, False]
 
 
+@pytest.mark.parametrize("programs", [1, 2, 3])
+def test_the_longer_a_gain_waits_for_the_judge_the_less_is_enough(tmp_path: Path, programs: int) -> None:
+    """The next program may gain as much again, and the judge takes longer than that."""
+    portfolio = (planner := planner_for(tmp_path)).portfolio
+    entry = Entry(roundabout(planner, 0.6))
+    incumbent = entry.cost / (1 - 1.01 * _PLENTY / programs)
+    assert [portfolio._due(entry, incumbent) for _ in range(programs)] == [*(programs - 1) * [False], True]
+
+
 def test_what_most_likely_goes_the_wrong_way_around_does_not_hold_up_others(tmp_path: Path) -> None:
     planner = planner_for(tmp_path)
     portfolio, plan = planner.portfolio, roundabout(planner, 0.6)
@@ -326,7 +337,7 @@ def test_what_was_gained_is_judged_before_time_is_up(tmp_path: Path) -> None:
     portfolio = planner.portfolio
     entry = Entry(roundabout(planner, 0.6))
     portfolio.incumbent.judging_s = 1.0
-    for left, took, due in ((None, 1.0, False), (60.0, 1.0, False), (2.4, 1.0, True), (2.4, 0.1, False)):
+    for left, took, due in ((None, 1.0, False), (60.0, 1.0, False), (2.3, 1.0, True), (2.3, 0.1, False)):
         portfolio.deadline.set(left)
         portfolio._took.append(took)
         assert portfolio._due(entry, entry.cost * 1.005) is due
@@ -397,3 +408,25 @@ def test_drafts_are_compared_with_the_incumbent_by_what_second_rounds_have_gaine
         assert portfolio.busy(share * entry.coarse) is busy, "its second round may make it the best"
     entry.rounds = 2
     assert not portfolio.busy(10 * entry.coarse), "it has had both"
+
+
+def test_ways_that_keep_a_draft_in_collision_are_given_up_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planner = planner_for(tmp_path)
+    portfolio = planner.portfolio
+    one, two, three = (Way(()) for _ in range(3))
+    plans = [roundabout(planner, height) for height in (0.2, 0.9, 0.5)]
+    drafts = [replace(portfolio.yielding.time(p.segments, p.transitions), conflict=1e-4) for p in plans]
+    ways = [{one, two}, {one, two, three}, {one, three}]
+    guilty = [{one, two}, {three}, {three}]
+    sketches = [Sketch(1.0, d, frozenset(w), frozenset(g)) for d, w, g in zip(drafts, ways, guilty, strict=True)]
+    assert portfolio.add_drafts(sketches) == 3
+    lodged, _, other = portfolio._entries[::-1]
+    monkeypatch.setattr(Optimiser, "stuck", property(lambda self: self is lodged.optimiser))
+    monkeypatch.setattr(Optimiser, "step", lambda self: 0.0)
+    assert portfolio.lodged() == []
+    portfolio.improve(10.0)
+    assert portfolio._entries == [other], "the other has one of the two ways only"
+    assert portfolio.lodged() == [{one, two}]
+    assert portfolio.lodged() == [], "it is said once"

@@ -11,8 +11,9 @@ import pytest
 from mrtamp.optimise.yielding import Draft, Yielding
 from mrtamp.options import Happening, Skeleton
 from mrtamp.planner import Planner
-from mrtamp.realisation import _CHEAPER, _LIKE, Realisation, _Drafted
-from mrtamp.skeleton_guidance import Proposal
+from mrtamp.portfolio import Sketch
+from mrtamp.realisation import _CHEAPER, _GROWTHS, _LIKE, Realisation, _Drafted
+from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
 from mrtamp.tasks import pick_place
 from mrtamp.transitions.ways import Stop, Way
 
@@ -73,7 +74,7 @@ def test_ways_that_conflict_are_not_drafted_together_again(monkeypatch: pytest.M
     blamed: list[tuple[int, set[Way]]] = []
     sketch, time = Realisation._sketch, Yielding.time
 
-    def noted(self: Realisation, proposal: Proposal) -> Draft | None:
+    def noted(self: Realisation, proposal: Proposal) -> Sketch | None:
         sketched.append(set(proposal.ways))
         return sketch(self, proposal)
 
@@ -92,3 +93,61 @@ def test_ways_that_conflict_are_not_drafted_together_again(monkeypatch: pytest.M
     assert len(sketched) > 5
     for k, ways in enumerate(sketched):
         assert not any(pair <= ways for n, pair in blamed if n <= k)
+
+
+@pytest.mark.parametrize(("doubtful", "taken"), [(2, 1), (100, 3)])
+def test_of_drafts_whose_robots_collide_where_they_end_one_is_refined_if_there_are_others(
+    monkeypatch: pytest.MonkeyPatch, doubtful: int, taken: int
+) -> None:
+    """The first so many are `doubtful`."""
+    planner = Planner(pick_place(2, 2), seed=0)
+    assert list(planner.improve(20, first=True))
+    sketched, refined, time = [0], list[Sketch](), Yielding.time
+
+    def lasting(self: Yielding, segments: list, transitions: list, *, early: bool = False) -> Draft:
+        draft = time(self, segments, transitions, early=early)
+        sketched[0] += 1
+        much = 1e-2 if sketched[0] <= doubtful else 0.0
+        return replace(draft, conflict=1e-4, blame={sketched[0] % len(transitions): much})
+
+    monkeypatch.setattr(Yielding, "time", lasting)
+    monkeypatch.setattr(planner.portfolio, "add_drafts", lambda drafts: refined.extend(drafts) or len(drafts))
+    while not refined:
+        planner.realisation.attempt()
+    assert len(refined) == 3
+    assert sum(sketch.doubtful for sketch in refined) == taken
+
+
+def test_ways_that_kept_a_draft_in_collision_are_not_drafted_together_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    planner = Planner(pick_place(2, 2), seed=0)
+    assert list(planner.improve(20, first=True))
+    refined = list[Sketch]()
+    monkeypatch.setattr(planner.portfolio, "add_drafts", lambda drafts: refined.extend(drafts) or len(drafts))
+    while not refined:
+        planner.realisation.attempt()
+    lodged = refined[0].ways
+    planner.portfolio._lodged.append(lodged)
+    n = len(refined)
+    for _ in range(6):
+        planner.realisation.attempt()
+    assert len(refined) > n
+    assert all(not lodged <= sketch.ways for sketch in refined[n:])
+
+
+@pytest.mark.parametrize(
+    ("kinds", "first", "later"), [(0, 1, 1), (4, _GROWTHS // 4, _GROWTHS // 8), (_GROWTHS + 1, 1, 1)]
+)
+def test_the_fewer_kinds_of_ways_there_are_the_more_often_they_are_sampled(
+    monkeypatch: pytest.MonkeyPatch, kinds: int, first: int, later: int
+) -> None:
+    planner = Planner(pick_place(2, 2), seed=0)
+    assert list(planner.improve(20, first=True))
+    assert planner.skeletons.kinds >= 2, "each cube, for every arm that can"
+    monkeypatch.setattr(SkeletonGuidance, "kinds", kinds)
+    grown = []
+    monkeypatch.setattr(Realisation, "_more_ways", lambda self: grown.append(self) or 1.0)
+    for undrafted, times in ((True, first), (False, later)):
+        grown.clear()
+        planner.realisation.undrafted = undrafted
+        planner.realisation._grow()
+        assert len(grown) == times

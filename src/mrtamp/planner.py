@@ -72,7 +72,7 @@ class Options:
     transition_samples: int = 48
     extensions: int = 3
     persistent: float = 0.1
-    refinement_share: float = 0.9
+    refinement_share: float = 0.95
     intra_orbit: str = "tensor-tree"
     without: frozenset[str] = frozenset()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from mrtamp.portfolio_entry import FIRST, FIRST_SEARCH, LATER, NEARLY, OTHER_WAY
 from mrtamp.problem import Problem
 from mrtamp.refine import Refiner
 from mrtamp.transitions.sampler import TransitionSampler
+from mrtamp.transitions.ways import Way
 from mrtamp.validity import Validity
 
 SIZE = 6
@@ -45,9 +46,9 @@ _EPS = 1e-9
 """By how much the costs of a plan and of the polyline that it was made from may differ."""
 WORTH_CHECKING = 0.002
 """Relative gain over the incumbent that is worth a check."""
-_PLENTY, _PATIENCE, _LONGER = 0.01, 4, 24
-"""Relative gain that is checked at once, and programs after which a smaller one is: more of them where they are small
-ones of local search."""
+_PLENTY, _PATIENCE, _LONGER = 0.04, 4, 24
+"""Relative gain that is checked at once, half of it after another program and so on, and programs after which a smaller
+one is: more of them where they are small ones of local search."""
 _POOR = 1.12
 """How many times as much as skeletons promise a converged plan costs that others had better challenge."""
 _FINER = 0.95
@@ -56,9 +57,21 @@ _PROMISING = 0.99
 """Share of the incumbent's cost below which a draft has to be expected to end to go on before there are others."""
 _ROUNDS = 6
 """Rounds without gain after which a plan is left alone."""
-_LAST, _RECENT = 1.5, 6
-"""When there is no more time than the judge takes so many times, and the longest of so many programs (with what mends
+_LAST, _RECENT = 1.2, 6
+"""When there is no more time than so many times what the judge and the longest of so many programs (with what mends
 their outcome) took, what was gained is checked at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """A draft, what its skeleton was to cost, the ways it takes, those of them that have most of the conflict, and
+    whether that is so much that they may not come free."""
+
+    estimate: float
+    draft: Draft
+    ways: frozenset[Way] = frozenset()
+    guilty: frozenset[Way] = frozenset()
+    doubtful: bool = False
 
 
 class Portfolio:
@@ -88,6 +101,8 @@ class Portfolio:
         self._patiences = [replace(p, local=local) for p in (OTHER_WAYS, SAME_WAYS)]
         self._entries: list[Entry] = []
         self._settled: list[Plan] = []
+        self._lodged: list[frozenset[Way]] = []
+        """Ways that made drafts stay in collision."""
         self._seen: set[float] = set()
         self._took: deque[float] = deque(maxlen=_RECENT)
         """Seconds that the last programs took."""
@@ -151,20 +166,27 @@ class Portfolio:
         """Whether a plan with the same order of events is under refinement."""
         return any(order_of(e.plan.transitions) == order_of(transitions) for e in self._entries)
 
-    def add_drafts(self, drafts: Sequence[tuple[float, Draft]]) -> int:
+    def add_drafts(self, drafts: Sequence[Sketch]) -> int:
         """Put motions in which robots still collide with each other under convex programming; how many are new.
 
-        They come with what their skeletons were to cost.  The first is worked on first: among those on trial the newest
-        goes on.
+        The first is worked on first: among those on trial the newest goes on.
         """
         fresh = []
-        for estimate, draft in drafts:
+        for sketch in drafts:
+            draft = sketch.draft
             plan = self.incumbent.plan(draft.segments, draft.transitions)
             if round(plan.cost, 6) in self._seen:
                 continue
             self._seen.add(round(plan.cost, 6))
             free = self.incumbent.accepted(draft.segments, draft.transitions) if draft.conflict == 0.0 else None
-            entry = Entry(free or plan, draft=free is None, estimate=estimate, patience=self.patience)
+            entry = Entry(
+                free or plan,
+                draft=free is None,
+                estimate=sketch.estimate,
+                patience=self.patience,
+                ways=sketch.ways,
+                guilty=sketch.guilty,
+            )
             entry.optimiser = self._optimiser(entry)
             fresh.append(entry)
         self._admit(fresh[::-1])
@@ -425,6 +447,8 @@ class Portfolio:
         """Convergence: what was gained decides whether the plan is worth another round; a draft is given up."""
         work = entry.optimiser
         self._learn(entry)
+        if entry.draft and isinstance(work, Optimiser) and work.stuck:
+            self._beware(entry)
         if entry.draft and not self._hopeful(entry, incumbent):
             self._entries.remove(entry)
             return
@@ -456,6 +480,17 @@ class Portfolio:
         """Keep the ways that robots take in a plan that is done with, for the time being or for good."""
         if entry.optimiser is not None and (entry.over or not entry.on_trial):
             self.stock.add(*entry.optimiser.latest())
+
+    def _beware(self, lodged: Entry) -> None:
+        """Give up other drafts with the ways that most likely keep this one in collision."""
+        if lodged.guilty:
+            self._lodged.append(lodged.guilty)
+            self._entries = [e for e in self._entries if e is lodged or not e.draft or not lodged.guilty <= e.ways]
+
+    def lodged(self) -> list[frozenset[Way]]:
+        """Sets of ways that turned out to keep drafts in collision since this was last asked."""
+        out, self._lodged = self._lodged, []
+        return out
 
     def settled(self) -> list[Plan]:
         """Plans whose refinement has converged since this was last asked."""
@@ -489,9 +524,9 @@ class Portfolio:
         worth = entry.cost <= incumbent * (1 - WORTH_CHECKING)
         entry.waiting = entry.waiting + 1 if worth else 0
         patience = _LONGER if isinstance(entry.optimiser, LocalSearch) else _PATIENCE
-        needed = _LAST * self.incumbent.judging_s + max(self._took, default=0.0)
+        needed = _LAST * (self.incumbent.judging_s + max(self._took, default=0.0))
         last = worth and self.deadline.left_s < needed
-        due = last or entry.waiting > patience or entry.cost <= incumbent * (1 - _PLENTY)
+        due = last or entry.waiting > patience or entry.cost <= incumbent * (1 - _PLENTY / max(entry.waiting, 1))
         if due:
             entry.waiting = 0
         return due

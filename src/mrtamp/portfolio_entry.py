@@ -11,6 +11,7 @@ from mrtamp.effort import Effort
 from mrtamp.optimise import LocalSearch, Optimiser
 from mrtamp.plan import Plan
 from mrtamp.refine import Refiner
+from mrtamp.transitions.ways import Way
 
 _TRIAL, _FAST, _SLOWLY = 5, 0.03, 0.01
 """Conic programs that a plan gets before it is compared with the others, and more as long as each makes it cheaper by
@@ -56,7 +57,7 @@ class Patience:
 
 
 OTHER_WAYS = Patience(slow=0, hopeless=1.12, lately=5, shares=(0.5, 0.2))
-SAME_WAYS = Patience(slow=12, hopeless=1.02, lately=3, shares=(0.5, 0.12), same_ways=True)
+SAME_WAYS = Patience(slow=12, hopeless=1.02, lately=3, shares=(0.5, 0.06), same_ways=True)
 """Where there is no choice of ways, most plans come near to each other, but with many robots a few end far below."""
 
 
@@ -91,6 +92,9 @@ class Entry:
     """How often it has been timed anew, as a draft."""
     coarse: float = np.nan
     """What it cost after its first round."""
+    ways: frozenset[Way] = frozenset()
+    guilty: frozenset[Way] = frozenset()
+    """What its skeleton chose, if it began as a draft, and those of them that have most of the conflict (`Sketch`)."""
 
     @property
     def cost(self) -> float:

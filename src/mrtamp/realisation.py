@@ -16,7 +16,7 @@ from mrtamp.incumbent import Incumbent
 from mrtamp.optimise.descent import Descent
 from mrtamp.optimise.yielding import Draft
 from mrtamp.plan import Plan, Transition, plan_cost
-from mrtamp.portfolio import Portfolio
+from mrtamp.portfolio import Portfolio, Sketch
 from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
 from mrtamp.space_time import SpaceTime
 from mrtamp.tensor_tree import Node
@@ -26,9 +26,10 @@ _FIRST_WAYS, _MORE_WAYS = (80, 14), (64, 20)
 """IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
 _FIRST_SHORTENED, _SHORTENED = 16, 40
 """Of these, how many are shortened."""
-_GROWTHS, _SLOW_GROWTHS, _WORTH_GROWING = 3, 2, 0.02
-"""Before the first drafts ways are sampled up to so many times, fewer where that takes long since objects are handed
-over, as long as skeletons get cheaper by that share."""
+_GROWTHS, _SLOW_GROWTHS, _WORTH_GROWING = 32, 2, 0.02
+"""How often ways are sampled before the first drafts, all kinds of them together: the fewer there are the sooner chance
+has found the best; and how often where that takes long since objects are handed over, as long as skeletons get cheaper
+by that share.  Later it is half as often."""
 _REALISATIONS = 6
 """Skeletons that are tried at a time."""
 _QUICK, _THOROUGH = 30, 300
@@ -41,6 +42,9 @@ _AT_ONCE = 4
 """Skeletons that are drafted before what was learnt from them changes what is proposed."""
 _CONFLICT = 3e-3
 """Conflict of a draft (see `Draft`) from which on it hardly ever comes free of collision."""
+_DOUBTFUL = 1e-3
+"""What robots that collide where they end have to have in the blame, on top of the conflict, for a draft to be one of
+those of which only one is refined at a time, if there are others."""
 _GUILTY = 0.25
 """Share in the conflict from which on a way is to blame for it; where nobody has it, all are."""
 _DETERRENT = 100.0
@@ -178,17 +182,17 @@ class Realisation:
         return None
 
     def _grow(self) -> None:
-        """Sample more ways; where plans are to be drafted, until more of them hardly make skeletons cheaper."""
+        """Sample more ways; where objects are handed over, until more of them hardly make skeletons cheaper."""
         if self._first:
             self.skeletons.grow(*_FIRST_WAYS)
             if self.descent is not None:
                 self.skeletons.shorten(self.descent, _FIRST_SHORTENED)
             return
-        cheapest = np.inf
-        most = _SLOW_GROWTHS if self.skeletons.hands_over else _GROWTHS
-        for _ in range(most if self.undrafted else 1):
+        slow, kinds, cheapest = self.skeletons.hands_over, self.skeletons.kinds, np.inf
+        most = _SLOW_GROWTHS if slow else _GROWTHS // kinds if kinds else 1
+        for _ in range(max(most if self.undrafted else most // 2, 1)):
             before, cheapest = cheapest, self._more_ways()
-            if cheapest > (1 - _WORTH_GROWING) * before:
+            if slow and cheapest > (1 - _WORTH_GROWING) * before:
                 break
 
     def _more_ways(self) -> float:
@@ -222,14 +226,15 @@ class Realisation:
         if self._turn % 3 == 0 if choice else self._turn % 2 == 1:
             return False
         self.undrafted = False
-        drafts: list[tuple[float, Draft]] = []
+        self._crowded.update(self.portfolio.lodged())
+        drafts, spare = list[Sketch](), list[Sketch]()
         sketched = 0
         while sketched < _SKETCHED and len(drafts) < (_DRAFTS if choice else 1):
             below = self.portfolio.worth_drafting(self.to_beat())
             found = self.skeletons.propose(below, _THOROUGH)
             proposals, crowded = [], False
             for proposal in found:
-                if self._conflicts(proposal):
+                if self._conflicts(proposal, drafts):
                     crowded = True
                 elif not self._drafted.knows(proposal):
                     proposals.append(proposal)
@@ -241,17 +246,18 @@ class Realisation:
                     return True
                 break
             for proposal in proposals:
-                if self._conflicts(proposal) or (drafts and not choice):
+                if self._conflicts(proposal, drafts) or (drafts and not choice):
                     continue
                 sketched += 1
                 draft = self._sketch(proposal)
                 if draft is not None:
                     self._drafted.add(proposal)
-                    drafts.append((proposal.skeleton.cost, draft))
-        drafts.sort(key=lambda x: x[0] * (1 + _DETERRENT * x[1].conflict))
+                    (spare if draft.doubtful and any(d.doubtful for d in drafts) else drafts).append(draft)
+        drafts += spare[: max(_DRAFTS - len(drafts), 0)]
+        drafts.sort(key=lambda x: x.estimate * (1 + _DETERRENT * x.draft.conflict))
         return self.portfolio.add_drafts(drafts[:_DRAFTS]) > 0
 
-    def _sketch(self, proposal: Proposal) -> Draft | None:
+    def _sketch(self, proposal: Proposal) -> Sketch | None:
         """The draft of a skeleton; None where there is too much conflict, which then counts against its ways."""
         self.skeletons.realised(proposal)
         timed = self.growth.insert(proposal, self.skeletons, self.root, alone=True)
@@ -260,18 +266,20 @@ class Realisation:
         # Either is better about as often as the other, and seldom both lead to the same plan.
         self._early = not self._early
         draft = self.portfolio.yielding.time(*timed, early=self._early)
-        if draft.conflict < _CONFLICT:
-            return draft
         blamed = self._blamed(proposal, timed[1], draft)
+        whole = max(draft.conflict, *blamed.values()) if blamed else 0.0
+        guilty = frozenset(w for w, much in blamed.items() if much > _GUILTY * whole) or frozenset(proposal.ways)
+        if draft.conflict < _CONFLICT:
+            doubtful = whole > draft.conflict + _DOUBTFUL
+            return Sketch(proposal.skeleton.cost, draft, frozenset(proposal.ways), guilty, doubtful)
         self.skeletons.crowded(blamed)
-        guilty = [w for w, much in blamed.items() if much > _GUILTY * draft.conflict]
-        self._crowded.add(frozenset(guilty or proposal.ways))
+        self._crowded.add(guilty)
         return None
 
-    def _conflicts(self, proposal: Proposal) -> bool:
-        """Whether some of its ways conflicted in a draft before."""
+    def _conflicts(self, proposal: Proposal, drafts: Sequence[Sketch]) -> bool:
+        """Whether some of its ways conflicted in a draft before, or may not come free in one of these."""
         own = set(proposal.ways)
-        return any(ways <= own for ways in self._crowded)
+        return any(w <= own for w in self._crowded) or any(d.doubtful and d.guilty <= own for d in drafts)
 
     @staticmethod
     def _blamed(proposal: Proposal, transitions: Sequence[Transition], draft: Draft) -> Mapping[Way, float]:

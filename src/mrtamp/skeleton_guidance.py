@@ -384,6 +384,11 @@ class SkeletonGuidance:
         counts += [len(self.sampler.reaching.stands(s.name)) for s in self.problem.subgoals]
         return any(n != 1 for n in counts)
 
+    @property
+    def kinds(self) -> int:
+        """Number of sets of ways that grow: one for every task and the robots that may do it."""
+        return len(self.ways.of)
+
     def _determined(self, sets: Mapping[str, list[list[Way]]]) -> bool:
         """Whether there is one way for every task and one order of them all."""
         if self.has_choice or any(len(options[0][0].stops) > 1 for options in sets.values()):

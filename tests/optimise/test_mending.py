@@ -100,3 +100,16 @@ def test_penetrations_of_all_robots_together_are_what_is_tolerated(tmp_path: Pat
     assert not found(0.0125)
     assert {v.who for v in found(0.011)} == {("a",), ("a", "b")}
     assert max(float(v.depth.max()) for v in found(0.011)) == pytest.approx(0.0012, abs=4e-4)
+
+
+@pytest.mark.parametrize(("gain", "mends"), [(0.01, False), (0.001, True)])
+def test_what_the_next_program_gains_more_on_is_not_mended_yet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, mends: bool
+) -> None:
+    scp = optimiser(around(tmp_path, 0.0009), draft=True)
+    grazing, asked = scp._now, []
+    scp._now = replace(grazing, cost=grazing.cost / (1 - gain))
+    monkeypatch.setattr(scp, "_solve", lambda *_: grazing)
+    monkeypatch.setattr(scp.mending, "attempt", lambda *_: asked.append(True))
+    scp.step()
+    assert bool(asked) is mends

@@ -153,3 +153,14 @@ def test_prismatic_robots_without_gripper_have_rows_too(tmp_path: Path) -> None:
     collisions = rows(discs)
     assert collisions.A.shape[0] == len(collisions.gap)
     assert isinstance(discs.nearness, Nearness)
+
+
+def test_finer_levels_look_at_more_samples_of_every_step(gantries: Optimiser) -> None:
+    coarse = rows(gantries)
+    gantries.collisions.level = 1
+    fine = rows(gantries)
+    steps = gantries._now.line.knots - 1
+    for who, distance in coarse.clearance.items():
+        assert distance.shape == (steps, 3)
+        assert fine.clearance[who].shape == (steps, 5)
+        assert fine.clearance[who][:, ::2] == pytest.approx(distance), "those it had are among them"

@@ -14,7 +14,7 @@ from gantry import gantry_problem, valid_plan
 from mrtamp.check import Checker
 from mrtamp.collision import Collision
 from mrtamp.optimise.nearness import Nearness
-from mrtamp.optimise.yielding import _EARLY, _PARTS, Draft, Yielding, _divided
+from mrtamp.optimise.yielding import _EARLY, _LASTING, _PARTS, Draft, Yielding, _divided
 from mrtamp.plan import Plan, Segment, Transition, plan_cost
 from mrtamp.problem import Problem
 
@@ -187,7 +187,9 @@ def test_the_events_that_robots_are_on_their_way_to_are_to_blame(tmp_path: Path)
     segments[2] = Segment(plan.segments[1].mode.after(split[1]), last)
     draft = Yielding(problem, Nearness(Collision(problem))).time(segments, split)
     assert draft.conflict > 0
-    assert draft.blame[1] == pytest.approx(draft.conflict) == draft.blame[2]
+    # In the end they overlap, and the shortest way out is up: discs are 0.1 m high.
+    lasting = _LASTING * 0.1**2
+    assert draft.blame[1] == pytest.approx(draft.conflict + lasting) == draft.blame[2]
     assert draft.blame.get(0, 0.0) == pytest.approx(0.0)
 
 

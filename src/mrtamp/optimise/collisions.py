@@ -19,6 +19,8 @@ Demands = dict[Who, dict[tuple[int, float, int], int]]
 
 _NEAR = 0.06
 """Distance (m) below which pairs of solids enter the program."""
+_PIECES = (2, 4)
+"""Samples per step, at the coarse level and at finer ones, where less is left to mend then."""
 _MARGIN = 1.5e-3
 """Clearance (m) that the program asks for at its samples."""
 _STRICTER = 1e-3
@@ -130,7 +132,7 @@ class Collisions:
     ----------
     nearness : measures distances.
     tolerance : penetration (m) that the problem tolerates at an instant.
-    pieces : samples per step.
+    pieces : samples per step; by default more of them at a finer level.
     reach : distance (m) below which pairs of solids enter programs.
     margin, stricter : clearance (m) that is asked for, and how much more for every time that a sample was in collision.
     """
@@ -140,14 +142,14 @@ class Collisions:
         nearness: Nearness,
         tolerance: float,
         *,
-        pieces: int = 2,
+        pieces: int | None = None,
         reach: float = _NEAR,
         margin: float = _MARGIN,
         stricter: float = _STRICTER,
     ) -> None:
         self.nearness = nearness
         self.tolerance = tolerance
-        self.pieces = pieces
+        self._pieces = pieces
         self.reach = reach
         self.margin = margin
         self.stricter = stricter
@@ -156,6 +158,11 @@ class Collisions:
         """Clearance (m) that is asked for everywhere on top, to come free of collision between samples too."""
         self.demands: Demands = {}
         """Where more clearance is asked for; steps are those of the polyline at hand."""
+
+    @property
+    def pieces(self) -> int:
+        """Samples per step."""
+        return self._pieces or _PIECES[min(self.level, 1)]
 
     # -- demands ----------------------------------------------------------------------------------------------------
 

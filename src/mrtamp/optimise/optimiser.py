@@ -47,6 +47,9 @@ _TRUE, _FALSE = 0.7, 0.25
 _GAINING, _STRIDE = 0.01, 0.6
 """As long as every step makes a plan cheaper by that share, that much of the first trust region is kept: some of the
 collisions are left to later, smaller steps."""
+_SETTLED = 0.002
+"""What a step gains less than that share of, if it leads to what grazes something, is mended: before, the next step
+gains more in the time."""
 _GRAZES = 2
 """Iterates in collision, one after another, after which more clearance is asked for."""
 _PADS = (0.0, 0.003, 0.006)
@@ -308,7 +311,8 @@ class Optimiser:
             rows = rows.joined(self.collisions.more(*where, self.collisions.learn(violations)))
         falling = candidate.cost < (1 - _GAINING) * now.cost
         gaining = falling and np.isfinite(self.cost)
-        mended = self._mended(candidate, violations) if violations and not falling else None
+        settled = candidate.cost >= (1 - _SETTLED) * now.cost
+        mended = self._mended(candidate, violations) if violations and settled else None
         if mended is None:
             after = self._merit(candidate, rows)
         else:

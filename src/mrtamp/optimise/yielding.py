@@ -30,6 +30,8 @@ _CHARGE = (10.0, 300.0)
 """By how many times motion at a penetration of 1 m seems longer than it is: linear and quadratic in the depth."""
 _EARLY = 0.3
 """By how much time counts more in the beginning than in the end where robots are to be early."""
+_LASTING = 5.0
+"""For how much further motion (rad or m) robots are to blame that collide in the end, since nobody leaves any more."""
 _NEVER = 1e6
 """What it costs to do something too early."""
 
@@ -39,7 +41,8 @@ class Draft:
     """Motions that may still collide; `conflict` is the squared depth of penetration (m^2) along the motion (rad or m).
 
     What is grazed for long is easily pulled apart; robots that pass through each other are not.  `blame` has how much
-    of it there is on the way to events, by their number among those that were to be timed, for all who are involved.
+    of it there is on the way to events, by their number among those that were to be timed, for all who are involved;
+    robots that collide where they end have the more of it.
     """
 
     segments: list[Segment]
@@ -253,11 +256,15 @@ class Yielding:
             step = np.maximum(step, np.where(np.diff(at, prepend=0) > 0, courses[r].step[at], 0.0))
         row, column, length = _cheapest(step, course.step, depth, never, _EARLY if early else 0.0)
         out = {**{r: at[row] for r, at in nodes.items()}, robot: column}
+        conflict = 0.0
         for part in parts:
             share = length * depth[row, column] * part.depth[row, column]
+            conflict += float(share.sum())
+            if len(part.robots) == 2:
+                share[-1] += _LASTING * part.depth[-1, -1] ** 2
             for k, much in _attributed(part, share, courses, out):
                 blame[k] += much
-        return out, float(length @ depth[row, column] ** 2)
+        return out, conflict
 
     def _depths(self, one: str, a: _Course, two: str, b: _Course) -> np.ndarray:
         """Deepest penetration (C, D) of robots one and two where it is measured along their ways."""
