@@ -253,7 +253,7 @@ def test_a_worker_that_is_killed_costs_only_its_run(tmp_path: Path) -> None:
     try:
         harness, give_up = psutil.Process(process.pid), time.monotonic() + 60
         busy: list[psutil.Process] = []
-        while not busy:
+        while len(busy) < 2:  # before both are, one may still be starting
             assert process.poll() is None and time.monotonic() < give_up
             time.sleep(0.1)
             busy = [worker for worker in harness.children() if runs_of(worker)]
