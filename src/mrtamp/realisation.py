@@ -46,7 +46,8 @@ _DOUBTFUL = 1e-3
 """What robots that collide where they end have to have in the blame, on top of the conflict, for a draft to be one of
 those of which only one is refined at a time, if there are others."""
 _GUILTY = 0.25
-"""Share in the conflict from which on a way is to blame for it; where nobody has it, all are."""
+"""Share in the conflict, or in the most that any way is to blame for where that is more, from which on a way is to
+blame; where nobody has it, all are."""
 _DETERRENT = 100.0
 """By how many times dearer a skeleton seems for a conflict of 1 in its draft."""
 _POOR = 2.0
