@@ -13,6 +13,7 @@ from gantry import Script, gantry_problem, grasp
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from mrtamp.check import Report, check_plan
+from mrtamp.check_stretches import Allowance
 from mrtamp.collision import Collision
 from mrtamp.modes import Attachment
 from mrtamp.plan import Plan, Segment, Transition
@@ -299,3 +300,48 @@ def test_the_judge_and_the_planners_plants_agree_with_the_formula(problem: Probl
         assert hit == (into_disc > tolerance)
         verdicts.add((into_wall > 0, into_disc > 0, into_wall + into_disc <= tolerance))
     assert len(verdicts) >= 6
+
+
+def test_what_is_tolerated_holds_at_every_instant_of_a_motion(problem: Problem) -> None:
+    """Two discs that rub against a wall and each other, at random, against a close look at the formula."""
+    rng = np.random.default_rng(1)
+    verdicts = []
+    t = np.linspace(0, 1, 4001)[:, None]
+    for _ in range(120):
+        # Some of them so short that only their ends are looked at unless there is more to know.
+        tolerance, far = float(rng.choice([0.002, 0.004, 0.01])), float(rng.choice([0.02, 0.5]))
+        a = np.column_stack([rng.uniform(-0.7, -0.6) + far * rng.uniform(0, 1, 2), rng.uniform(0.244, 0.254, 2)])
+        angle = np.clip(rng.uniform(0.3, 2.8) + np.array([0, rng.choice([-0.2, 0.2])]), 0.3, 2.8)
+        gap = rng.uniform(-0.003, 0.003, 2)
+        b = a + (2 * RADIUS + gap)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        along_a, along_b = ((1 - t) * ends[0] + t * ends[1] for ends in (a, b))
+        into_wall = np.maximum(0.05 + RADIUS - along_a[:, 1], 0.0)
+        into_disc = np.maximum(2 * RADIUS - np.linalg.norm(along_b - along_a, axis=1), 0.0)
+        most = float((into_wall + into_disc).max())
+        if abs(most - tolerance) < 2e-4:
+            continue  # Drake's depths are good to 2e-5
+        robots = tuple(dataclasses.replace(r, start=ends[0]) for r, ends in zip(problem.robots, (a, b), strict=True))
+        rules = CollisionRules((), tolerance)
+        here = dataclasses.replace(problem, robots=robots, subgoals=(), goal=(), objects=(), collision=rules)
+        report = check_plan(Errands(here).move(a=a[1], b=b[1]).plan())
+        assert report.ok == (most <= tolerance), (most, tolerance, str(report))
+        verdicts.append((report.ok, most > 0.0, most > max(into_wall.max(), into_disc.max()) + 1e-3))
+    assert len(verdicts) > 80
+    assert {(True, True, True), (False, True, True)} <= set(verdicts)
+
+
+def test_an_allowance_is_given_out_once() -> None:
+    rng = np.random.default_rng(0)
+    s, tolerance = np.linspace(0, 1, 5), 0.01
+    allowance = Allowance(tolerance, s)
+    granted: dict[tuple[int, int], float] = {}
+    for _ in range(6):
+        begin, pair, depth = rng.uniform(0, 0.99, 20), rng.integers(0, 8, 20), rng.uniform(0, 0.008, 20)
+        given = allowance.granted(begin, pair, depth)
+        for t, k, d in zip(begin[given], pair[given], depth[given], strict=True):
+            key = int(4 * t), int(k)
+            granted[key] = max(granted.get(key, 0.0), d)
+    for part in range(4):
+        total = sum(d for (at, _), d in granted.items() if at == part)
+        assert 0.5 * tolerance < total <= tolerance
+    assert not Allowance(0.0, s).granted(np.zeros(1), np.zeros(1, dtype=int), np.full(1, 1e-6)).any()

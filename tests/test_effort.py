@@ -102,3 +102,16 @@ def test_only_what_is_available_is_chosen() -> None:
         e.record(name, 1.0, 0.0)
     assert e.total["refinement"] == 0.0
     assert e.total["search"] > 0.0 and e.total["skeletons"] > 0.0
+
+
+@pytest.mark.parametrize("available", [["search", "refinement"], list(FLOORS)])
+def test_who_is_eager_has_all_that_the_floors_of_the_other_available_ones_leave(available: list[str]) -> None:
+    e = Effort(FLOORS, PRIOR)
+    turns = Counter[str]()
+    for _ in range(1000):
+        name = e.next(available, eager="refinement")
+        e.record(name, 1.0, 0.0)
+        turns[name] += 1
+    left = 1.0 - sum(FLOORS[name] for name in available if name != "refinement")
+    assert turns["refinement"] / 1000 == pytest.approx(left, abs=0.03)
+    assert set(turns) == set(available)

@@ -16,8 +16,8 @@ from mrtamp.optimise import Optimiser
 from mrtamp.options import Skeleton
 from mrtamp.plan import Plan
 from mrtamp.planner import Options, Planner
-from mrtamp.portfolio import _PATIENCE, _PLENTY, SIZE, Portfolio, Sketch
-from mrtamp.portfolio_entry import Entry
+from mrtamp.portfolio import _PATIENCE, _PLENTY, SIZE, Portfolio
+from mrtamp.portfolio_entry import Entry, Sketch
 from mrtamp.skeleton_guidance import Proposal
 from mrtamp.transitions.ways import Way
 
@@ -365,7 +365,8 @@ def test_rounds_of_local_search_and_of_finer_programs_take_turns(
 def sequential(planner: Planner) -> Entry:
     """A draft, past its trial, of discs that go one after the other although nothing keeps them from going at once."""
     plan = roundabout(planner, 0.9)
-    entry = Entry(plan, draft=True, estimate=1.0, patience=planner.portfolio.patience)
+    draft = planner.portfolio.yielding.time(plan.segments, plan.transitions)
+    entry = Entry(plan, draft=True, sketch=Sketch(1.0, draft), patience=planner.portfolio.patience)
     entry.optimiser = planner.portfolio._optimiser(entry)
     entry.optimiser.step()
     entry.optimiser.steps = 100
@@ -425,8 +426,7 @@ def test_ways_that_keep_a_draft_in_collision_are_given_up_together(
     lodged, _, other = portfolio._entries[::-1]
     monkeypatch.setattr(Optimiser, "stuck", property(lambda self: self is lodged.optimiser))
     monkeypatch.setattr(Optimiser, "step", lambda self: 0.0)
-    assert portfolio.lodged() == []
+    assert portfolio.crowded == set()
     portfolio.improve(10.0)
     assert portfolio._entries == [other], "the other has one of the two ways only"
-    assert portfolio.lodged() == [{one, two}]
-    assert portfolio.lodged() == [], "it is said once"
+    assert portfolio.crowded == {frozenset({one, two})}

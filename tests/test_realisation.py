@@ -11,7 +11,7 @@ import pytest
 from mrtamp.optimise.yielding import Draft, Yielding
 from mrtamp.options import Happening, Skeleton
 from mrtamp.planner import Planner
-from mrtamp.portfolio import Sketch
+from mrtamp.portfolio_entry import Sketch
 from mrtamp.realisation import _CHEAPER, _GROWTHS, _LIKE, Realisation, _Drafted
 from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
 from mrtamp.tasks import pick_place
@@ -80,7 +80,7 @@ def test_ways_that_conflict_are_not_drafted_together_again(monkeypatch: pytest.M
 
     def hopeless(self: Yielding, segments: list, transitions: list, *, early: bool = False) -> Draft:
         draft = time(self, segments, transitions, early=early)
-        first = {r: next(k for k, t in enumerate(transitions) if r in t.active) for r in segments[0].q}
+        first = {r: k for k, t in reversed(list(enumerate(transitions))) for r in t.active}
         objects = {transitions[k].actions[0].object for k in first.values()}
         ways = {way for way in sketched[-1] if way.stops[0].after and way.stops[0].after.object in objects}
         blamed.append((len(sketched), ways))
@@ -126,12 +126,32 @@ def test_ways_that_kept_a_draft_in_collision_are_not_drafted_together_again(monk
     while not refined:
         planner.realisation.attempt()
     lodged = refined[0].ways
-    planner.portfolio._lodged.append(lodged)
+    planner.portfolio.crowded.add(lodged)
     n = len(refined)
     for _ in range(6):
         planner.realisation.attempt()
     assert len(refined) > n
     assert all(not lodged <= sketch.ways for sketch in refined[n:])
+
+
+def test_where_nothing_is_left_to_draft_what_was_ruled_out_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    planner = Planner(pick_place(2, 2), seed=0)
+    assert list(planner.improve(20, first=True))
+    realisation, portfolio = planner.realisation, planner.portfolio
+    portfolio.crowded.add(frozenset({Way(())}))
+    monkeypatch.setattr(portfolio, "add_drafts", lambda drafts: 0)
+    realisation._draft()
+    assert portfolio.crowded == set()
+    once = realisation._drafted.like
+    assert once < _LIKE
+    realisation._turn = 0
+    realisation._draft()
+    assert realisation._drafted.like < once
+    monkeypatch.setattr(portfolio, "add_drafts", lambda drafts: 1)
+    realisation._drafted._known.clear()
+    realisation._turn = 0
+    realisation._draft()
+    assert realisation._drafted.like == _LIKE
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,7 @@ import numpy as np
 from mrtamp.check_contact import TOUCH
 from mrtamp.check_report import Report, Side, Violation
 from mrtamp.check_scene import JudgeScene, box_gap
-from mrtamp.check_stretches import NOISE, Pairs, Samples, Stretches
-from mrtamp.kinematics import inverse
+from mrtamp.check_stretches import NOISE, Allowance, Pairs, Samples, Stretches
 
 STRIDE = 0.1
 """Displacement (m) of any robot point between the samples from which bisection starts: the pace in free space."""
@@ -193,7 +192,8 @@ class MotionJudge:
         ends = np.stack([start, start + 1], axis=1)
         normals = np.concatenate([normal, np.full((1, 3), np.nan)])[row[ends, pair[:, None]]]
         stretches = Stretches(start, start + 1, pair, d[ends, pair[:, None]], normals)
-        self._bisect(samples, pairs, stretches, report, exempt, hits)
+        allowance = Allowance(self.tolerance - self._standing(line, pairs.solids[moved.any(axis=0)]), s)
+        self._bisect(samples, pairs, stretches, allowance, report, exempt, hits)
         hits.report(report)
 
     def _open(self, pairs: Pairs, s: np.ndarray, d: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -239,12 +239,13 @@ class MotionJudge:
         samples: Samples,
         pairs: Pairs,
         stretches: Stretches,
+        allowance: Allowance,
         report: Report,
         exempt: Mapping[tuple[str, str], tuple[float, float]],
         hits: _Hits,
     ) -> None:
         """Halve the stretches that their ends do not certify until nothing is left open; note what collides."""
-        stretches = stretches.unsettled(samples, pairs)
+        stretches = stretches.unsettled(samples, pairs, allowance)
         while len(stretches) and not (hits and report.first_only):
             # Stretches of several pairs share one sample in the middle.
             middle = (samples.s[stretches.start] + samples.s[stretches.end]) / 2
@@ -257,7 +258,16 @@ class MotionJudge:
             d, normal, hit = self._looked_at(samples, pairs, at, stretches.pair, exempt, hits, report)
             # A pair that collides is not searched any further here: its stretch is known to be bad.
             free = ~hit
-            stretches = stretches.where(free).halves(at[free], d[free], normal[free]).unsettled(samples, pairs)
+            stretches = stretches.where(free).halves(at[free], d[free], normal[free])
+            stretches = stretches.unsettled(samples, pairs, allowance)
+
+    def _standing(self, line: Timeline, moving: np.ndarray) -> float:
+        """Penetration (m) of all pairs but the `moving` ones (P, 2), which is the same all the way."""
+        if self.tolerance <= 0.0:
+            return 0.0
+        others = line.motion.allowed | set(map(tuple, moving.tolist()))
+        query = self.world.query(line.state(np.zeros(1))[0][0])
+        return sum(depth for pair, depth in self.world.penetrations(query).items() if pair not in others)
 
     def _tolerated(
         self, line: Timeline, query: Any, s: float, exempt: Mapping[tuple[str, str], tuple[float, float]]
@@ -288,18 +298,20 @@ class MotionJudge:
         fixed = [i for i, solid in enumerate(world.solids) if solid.joint < 0 and solid.side.kind != "object"]
         query = None
         done = set(motion.allowed)
+        still = fixed + [i for name in poses for i in world.of.get(name, [])]
+        solids = [world.solids[i] for i in still]
+        X_WC = np.array([poses.get(x.side.owner, world.X_WB[i]) @ x.X_BC for i, x in zip(still, solids, strict=True)])
+        half = np.array([x.half for x in solids])
         for name in names:
             for i in world.of.get(name, []) if name in poses else []:
-                for j in fixed + [j for other in poses if other != name for j in world.of.get(other, [])]:
-                    pair = (min(i, j), max(i, j))
-                    X_WC, X_WD = (
-                        poses.get(world.solids[k].side.owner, world.X_WB[k]) @ world.solids[k].X_BC for k in (i, j)
-                    )
-                    p = inverse(X_WD) @ X_WC[:, 3]
-                    if pair in done or box_gap(p[:3], world.solids[j].half) > world.solids[i].bound + TOUCH:
+                centre = X_WC[still.index(i), :3, 3]
+                gap = box_gap(np.einsum("na,nab->nb", centre - X_WC[:, :3, 3], X_WC[:, :3, :3]), half)
+                for j in (still[k] for k in np.flatnonzero(gap <= world.solids[i].bound + TOUCH)):
+                    pair, other = (min(i, j), max(i, j)), world.solids[j].side.owner
+                    if pair in done or other == name:
                         continue
                     done.add(pair)
-                    if not world.may_collide(*pair) or (name, world.solids[j].side.owner) in standing:
+                    if not world.may_collide(*pair) or (name, other) in standing:
                         continue
                     if query is None:
                         query = world.query(world.positions(motion.z[:1], poses)[0])

@@ -2,7 +2,8 @@
 
 No point moves further than its joints can carry it, nor further than its chord and twice what it strays from it
 (`check_bounds`).  And where the nearest points of two solids are in line with the normal of a plane that separates them
-at the other sample too, it does so all the way, if there is room for what their points stray from their chords.
+at the other sample too, it does so all the way, if there is room for what their points stray from their chords.  The
+same says how deep they penetrate at most where they do, and where that is tolerated it settles them as well.
 """
 
 from __future__ import annotations
@@ -66,6 +67,33 @@ class Pairs:
         return self.unsettled((d[:-1], d[1:]), moved, (s[:-1, None], s[1:, None]), slice(None))
 
 
+class Allowance:
+    """Penetration (m) that is tolerated, handed out to stretches that come to no more than that.
+
+    Between any two of the samples s (S,), what all pairs have been granted there adds up to at most `tolerance`.
+    """
+
+    def __init__(self, tolerance: float, s: np.ndarray) -> None:
+        self._s = s
+        self._left = np.full(len(s), tolerance)
+        self._of: dict[tuple[int, int], float] = {}
+
+    def granted(self, s: np.ndarray, pair: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Which pairs (E,) may be as deep as `depth` (E,) in stretches that begin at s (E,); the least goes first."""
+        out = np.zeros(len(s), dtype=bool)
+        at = np.searchsorted(self._s, s, side="right") - 1
+        hopeful = np.flatnonzero(depth <= self._left[at])
+        for e in hopeful[np.argsort(depth[hopeful], kind="stable")].tolist():
+            k, key = int(at[e]), (int(at[e]), int(pair[e]))
+            before = self._of.get(key, 0.0)
+            more = max(float(depth[e]) - before, 0.0)
+            if more <= self._left[k]:
+                self._left[k] -= more
+                self._of[key] = before + more
+                out[e] = True
+        return out
+
+
 @dataclass(eq=False)
 class Stretches:
     """Stretches of motion (E,) of one pair each that distances at their ends have not settled.
@@ -82,8 +110,8 @@ class Stretches:
     def __len__(self) -> int:
         return len(self.pair)
 
-    def unsettled(self, samples: Samples, pairs: Pairs) -> Stretches:
-        """Those that are left when the ways of points and planes between solids have settled what they can."""
+    def unsettled(self, samples: Samples, pairs: Pairs, allowance: Allowance) -> Stretches:
+        """Those that are left when the ways of points, planes between solids and the allowance have had their say."""
         ends = (self.start, self.end)
         s = (samples.s[self.start], samples.s[self.end])
         i, j = pairs.solids[self.pair].T
@@ -93,12 +121,16 @@ class Stretches:
         # A point at a share t of its way is at most t chords and a bend from its start, 1 - t and a bend from its end.
         moved = np.minimum(np.einsum("en,en->e", joints, pairs.rates[self.pair]), one + two + 2.0 * bend)
         left = pairs.unsettled((self.d[:, 0], self.d[:, 1]), moved, s, self.pair)
+        depth = (moved - self.d[:, 0] - self.d[:, 1]) / 2.0
         for end in (0, 1):
             # How far two planes between them are apart changes evenly, but for the bends.
             rows = np.flatnonzero(left)
             at = (self.start[rows], self.end[rows])
             parted = samples.snapshot.parted(i[rows], j[rows], at, self.normal[rows, end])
-            left[rows[parted > bend[rows] + NOISE]] = False
+            depth[rows] = np.fmin(depth[rows], bend[rows] - parted)
+            left[rows[depth[rows] < -NOISE]] = False
+        rows = np.flatnonzero(left)
+        left[rows[allowance.granted(s[0][rows], self.pair[rows], depth[rows] + NOISE)]] = False
         return self.where(left)
 
     def where(self, keep: np.ndarray) -> Stretches:

@@ -51,11 +51,11 @@ class Effort:
         """The one of the available activities that is furthest behind its share of the recent work.
 
         What is not available leaves its share to the others, up to their ceilings.  What is `eager`, since it is too
-        soon to tell what it gains, has all that the floors of the others leave.
+        soon to tell what it gains, has all that the floors of the other available ones leave.
         """
         shares = self.shares()
         if eager is not None:
-            shares = {**self.floors, eager: 1.0 - sum(self.floors[name] for name in self.floors if name != eager)}
+            shares = {**self.floors, eager: 1.0 - sum(self.floors[name] for name in available if name != eager)}
         whole = sum(shares[name] for name in available)
         scaled = {name: min(shares[name] / whole, self.ceilings[name]) for name in available}
         work = sum(self._work[name] for name in available)

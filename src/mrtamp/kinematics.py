@@ -243,7 +243,7 @@ class Tool:
         Rs, ps, _ = self._arm.sweep(q)
         return Rs[-1] @ self._R, ps[-1] + Rs[-1] @ self._p
 
-    def carried(self, Rs: Sequence[Array], ps: Sequence[Array]) -> tuple[Array, Array]:
+    def carried(self, Rs: Sequence[Array] | Array, ps: Sequence[Array] | Array) -> tuple[Array, Array]:
         """R_WG (N, 3, 3) and p_WG (N, 3) from the poses of all bodies, as `Chain.sweep` returns them."""
         R, p = Rs[self._body], ps[self._body]
         return R @ self._R, p + R @ self._p

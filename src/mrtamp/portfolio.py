@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,9 +15,9 @@ from mrtamp.incumbent import Incumbent
 from mrtamp.optimise import LocalSearch, Optimiser, Stock, tools_of
 from mrtamp.optimise.legs import order_of
 from mrtamp.optimise.nearness import Nearness
-from mrtamp.optimise.yielding import Draft, Yielding
+from mrtamp.optimise.yielding import Yielding
 from mrtamp.plan import Plan, Segment, Transition
-from mrtamp.portfolio_entry import FIRST, FIRST_SEARCH, LATER, NEARLY, OTHER_WAYS, SAME_WAYS, Entry
+from mrtamp.portfolio_entry import FIRST, FIRST_SEARCH, LATER, NEARLY, OTHER_WAYS, SAME_WAYS, Entry, Sketch
 from mrtamp.problem import Problem
 from mrtamp.refine import Refiner
 from mrtamp.transitions.sampler import TransitionSampler
@@ -62,18 +62,6 @@ _LAST, _RECENT = 1.2, 6
 their outcome) took, what was gained is checked at once."""
 
 
-@dataclass(frozen=True, eq=False)
-class Sketch:
-    """A draft, what its skeleton was to cost, the ways it takes, those of them that have most of the conflict, and
-    whether that is so much that they may not come free."""
-
-    estimate: float
-    draft: Draft
-    ways: frozenset[Way] = frozenset()
-    guilty: frozenset[Way] = frozenset()
-    doubtful: bool = False
-
-
 class Portfolio:
     """Up to SIZE plans and drafts in turns: the newest get a trial, then the cheapest goes on until it converges."""
 
@@ -101,8 +89,8 @@ class Portfolio:
         self._patiences = [replace(p, local=local) for p in (OTHER_WAYS, SAME_WAYS)]
         self._entries: list[Entry] = []
         self._settled: list[Plan] = []
-        self._lodged: list[frozenset[Way]] = []
-        """Ways that made drafts stay in collision."""
+        self.crowded: set[frozenset[Way]] = set()
+        """Ways that conflict too much with each other in a draft, or that it did not come free with."""
         self._seen: set[float] = set()
         self._took: deque[float] = deque(maxlen=_RECENT)
         """Seconds that the last programs took."""
@@ -179,14 +167,7 @@ class Portfolio:
                 continue
             self._seen.add(round(plan.cost, 6))
             free = self.incumbent.accepted(draft.segments, draft.transitions) if draft.conflict == 0.0 else None
-            entry = Entry(
-                free or plan,
-                draft=free is None,
-                estimate=sketch.estimate,
-                patience=self.patience,
-                ways=sketch.ways,
-                guilty=sketch.guilty,
-            )
+            entry = Entry(free or plan, draft=free is None, patience=self.patience, sketch=sketch)
             entry.optimiser = self._optimiser(entry)
             fresh.append(entry)
         self._admit(fresh[::-1])
@@ -235,6 +216,8 @@ class Portfolio:
         entry.optimiser.step()
         self._took.append(time.perf_counter() - began)
         entry.trail.append(entry.optimiser.outlook)
+        if entry.over and isinstance(entry.optimiser, Optimiser) and self._hopeful(entry, incumbent):
+            entry.optimiser.finish()
         due = self._due(entry, incumbent) or entry.over
         plan = self._offer(entry, incumbent, entry.optimiser) if due else None
         if entry.over and not self._timed_anew(entry):
@@ -447,8 +430,8 @@ class Portfolio:
         """Convergence: what was gained decides whether the plan is worth another round; a draft is given up."""
         work = entry.optimiser
         self._learn(entry)
-        if entry.draft and isinstance(work, Optimiser) and work.stuck:
-            self._beware(entry)
+        if entry.draft and entry.sketch is not None and isinstance(work, Optimiser) and work.stuck:
+            self._beware(entry.sketch)
         if entry.draft and not self._hopeful(entry, incumbent):
             self._entries.remove(entry)
             return
@@ -481,16 +464,13 @@ class Portfolio:
         if entry.optimiser is not None and (entry.over or not entry.on_trial):
             self.stock.add(*entry.optimiser.latest())
 
-    def _beware(self, lodged: Entry) -> None:
+    def _beware(self, lodged: Sketch) -> None:
         """Give up other drafts with the ways that most likely keep this one in collision."""
         if lodged.guilty:
-            self._lodged.append(lodged.guilty)
-            self._entries = [e for e in self._entries if e is lodged or not e.draft or not lodged.guilty <= e.ways]
-
-    def lodged(self) -> list[frozenset[Way]]:
-        """Sets of ways that turned out to keep drafts in collision since this was last asked."""
-        out, self._lodged = self._lodged, []
-        return out
+            self.crowded.add(lodged.guilty)
+            guilty = lodged.guilty
+            alike = {e for e in self._entries if e.draft and e.sketch is not None and guilty <= e.sketch.ways}
+            self._entries = [e for e in self._entries if e.sketch is lodged or e not in alike]
 
     def settled(self) -> list[Plan]:
         """Plans whose refinement has converged since this was last asked."""

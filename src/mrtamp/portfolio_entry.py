@@ -9,6 +9,7 @@ import numpy as np
 from mrtamp.collision import RESOLUTION
 from mrtamp.effort import Effort
 from mrtamp.optimise import LocalSearch, Optimiser
+from mrtamp.optimise.yielding import Draft
 from mrtamp.plan import Plan
 from mrtamp.refine import Refiner
 from mrtamp.transitions.ways import Way
@@ -61,6 +62,18 @@ SAME_WAYS = Patience(slow=12, hopeless=1.02, lately=3, shares=(0.5, 0.06), same_
 """Where there is no choice of ways, most plans come near to each other, but with many robots a few end far below."""
 
 
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """A draft, what its skeleton was to cost, the ways it takes, those of them that have most of the conflict, and
+    whether that is so much that they may not come free."""
+
+    estimate: float
+    draft: Draft
+    ways: frozenset[Way] = frozenset()
+    guilty: frozenset[Way] = frozenset()
+    doubtful: bool = False
+
+
 @dataclass(eq=False)
 class Entry:
     """A checked plan and what works on it: convex programming, in later rounds after some shortening.
@@ -70,8 +83,8 @@ class Entry:
 
     plan: Plan
     draft: bool = False
-    estimate: float = np.nan
-    """What its skeleton was to cost, if it began as a draft."""
+    sketch: Sketch | None = None
+    """What it began as, if that was a draft."""
     resolution: float = RESOLUTION
     refiner: Refiner | None = None
     optimiser: Optimiser | LocalSearch | None = None
@@ -92,9 +105,6 @@ class Entry:
     """How often it has been timed anew, as a draft."""
     coarse: float = np.nan
     """What it cost after its first round."""
-    ways: frozenset[Way] = frozenset()
-    guilty: frozenset[Way] = frozenset()
-    """What its skeleton chose, if it began as a draft, and those of them that have most of the conflict (`Sketch`)."""
 
     @property
     def cost(self) -> float:
@@ -150,7 +160,12 @@ class Entry:
 
     @property
     def began_as_draft(self) -> bool:
-        return bool(np.isfinite(self.estimate))
+        return self.sketch is not None
+
+    @property
+    def estimate(self) -> float:
+        """What its skeleton was to cost, if it began as a draft."""
+        return self.sketch.estimate if self.sketch is not None else np.nan
 
     @property
     def unchecked(self) -> bool:

@@ -16,7 +16,8 @@ from mrtamp.incumbent import Incumbent
 from mrtamp.optimise.descent import Descent
 from mrtamp.optimise.yielding import Draft
 from mrtamp.plan import Plan, Transition, plan_cost
-from mrtamp.portfolio import Portfolio, Sketch
+from mrtamp.portfolio import Portfolio
+from mrtamp.portfolio_entry import Sketch
 from mrtamp.skeleton_guidance import Proposal, SkeletonGuidance
 from mrtamp.space_time import SpaceTime
 from mrtamp.tensor_tree import Node
@@ -58,9 +59,9 @@ _MENDINGS = 8
 """Times that a realisation is judged, steps to which the judge objected being forbidden before the next."""
 _MANY = 12
 """Stops from which on a realisation takes too long for that."""
-_LIKE, _CHEAPER = 0.5, 0.97
-"""Difference of every joint (rad) up to which handovers have the same optimum as drafted ones, unless they promise to
-cost so much less."""
+_LIKE, _CHEAPER, _FADES = 0.5, 0.97, 0.7
+"""Difference of every joint (rad) up to which handovers are held to have the same optimum as drafted ones, unless they
+promise to cost so much less; and what is left of it when there was nothing else to draft."""
 
 
 class Realisation:
@@ -108,8 +109,6 @@ class Realisation:
         self._turn = 0
         self._early = self._urgent = False
         self._drafted = _Drafted()
-        self._crowded: set[frozenset[Way]] = set()
-        """Ways that conflict too much with each other in a draft."""
 
     def attempt(self) -> Plan | Node | None:
         """Grow the sets of ways and realise the cheapest skeletons that may beat the incumbent, until one succeeds.
@@ -201,8 +200,8 @@ class Realisation:
         self.skeletons.grow(*_MORE_WAYS)
         if self.descent is not None:
             self.skeletons.shorten(self.descent, _SHORTENED)
-        if not self.undrafted and (self.descent is None or not self.skeletons.hands_over):
-            # Nobody asks.
+        if not self.skeletons.hands_over or (self.descent is None and not self.undrafted):
+            # Nobody asks, and there is nothing to be shortened.
             return np.inf
         below = self.portfolio.worth_drafting(self.to_beat())
         proposals = list(self.skeletons.propose(below, _THOROUGH))
@@ -227,7 +226,6 @@ class Realisation:
         if self._turn % 3 == 0 if choice else self._turn % 2 == 1:
             return False
         self.undrafted = False
-        self._crowded.update(self.portfolio.lodged())
         drafts, spare = list[Sketch](), list[Sketch]()
         sketched = 0
         while sketched < _SKETCHED and len(drafts) < (_DRAFTS if choice else 1):
@@ -244,6 +242,7 @@ class Realisation:
             if not proposals:
                 # Nothing promises a gain, however it were realised, unless it only has to be realised in another way.
                 if not sketched and not crowded:
+                    self._relent()
                     return True
                 break
             for proposal in proposals:
@@ -256,7 +255,17 @@ class Realisation:
                     (spare if draft.doubtful and any(d.doubtful for d in drafts) else drafts).append(draft)
         drafts += spare[: max(_DRAFTS - len(drafts), 0)]
         drafts.sort(key=lambda x: x.estimate * (1 + _DETERRENT * x.draft.conflict))
-        return self.portfolio.add_drafts(drafts[:_DRAFTS]) > 0
+        added = self.portfolio.add_drafts(drafts[:_DRAFTS]) > 0
+        if added:
+            self._drafted.like = _LIKE
+        else:
+            self._relent()
+        return added
+
+    def _relent(self) -> None:
+        """There was nothing to draft: what was learnt about what need not be tried is only mostly right."""
+        self._drafted.like *= _FADES
+        self.portfolio.crowded.clear()
 
     def _sketch(self, proposal: Proposal) -> Sketch | None:
         """The draft of a skeleton; None where there is too much conflict, which then counts against its ways."""
@@ -274,13 +283,13 @@ class Realisation:
             doubtful = whole > draft.conflict + _DOUBTFUL
             return Sketch(proposal.skeleton.cost, draft, frozenset(proposal.ways), guilty, doubtful)
         self.skeletons.crowded(blamed)
-        self._crowded.add(guilty)
+        self.portfolio.crowded.add(guilty)
         return None
 
     def _conflicts(self, proposal: Proposal, drafts: Sequence[Sketch]) -> bool:
         """Whether some of its ways conflicted in a draft before, or may not come free in one of these."""
         own = set(proposal.ways)
-        return any(w <= own for w in self._crowded) or any(d.doubtful and d.guilty <= own for d in drafts)
+        return any(w <= own for w in self.portfolio.crowded) or any(d.doubtful and d.guilty <= own for d in drafts)
 
     @staticmethod
     def _blamed(proposal: Proposal, transitions: Sequence[Transition], draft: Draft) -> Mapping[Way, float]:
@@ -335,9 +344,15 @@ class Realisation:
 
 
 class _Drafted:
-    """Skeletons that had drafts of little conflict: others so much like them would be refined to the same plan."""
+    """Skeletons that had drafts of little conflict: others so much like them would be refined to the same plan.
+
+    Attributes
+    ----------
+    like : difference (rad) of every joint up to which others are.
+    """
 
     def __init__(self) -> None:
+        self.like = _LIKE
         self._known: dict[tuple, list[tuple[float, np.ndarray]]] = {}
 
     def add(self, proposal: Proposal) -> None:
@@ -354,7 +369,7 @@ class _Drafted:
             return False
         flat, cost = self._flat(proposal), proposal.skeleton.cost
         known = self._known.get(proposal.skeleton.order, [])
-        return any(cost > _CHEAPER * c and np.abs(flat - other).max(initial=0.0) < _LIKE for c, other in known)
+        return any(cost > _CHEAPER * c and np.abs(flat - other).max(initial=0.0) < self.like for c, other in known)
 
     @staticmethod
     def _comparable(proposal: Proposal) -> bool:

@@ -182,6 +182,7 @@ class LocalSearch:
             return 0.0
         self._trial = None
         before = self.cost
+        scp.finish()
         if scp.cost < trial.base:
             self._take(trial.piece.replaced(scp.segments()))
         self._costs = [*self._costs, self.cost][-_VAIN - 1 :]

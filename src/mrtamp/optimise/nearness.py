@@ -214,6 +214,19 @@ def _nowhere(n: int) -> Poses:
     return np.zeros((n, 3, 3)), np.full((n, 3), np.nan)
 
 
+_ABSENT = np.full((4, 4), np.nan)
+_ABSENT[:3, :3] = 0.0
+
+
+def _resting(poses: Sequence[Mapping[str, np.ndarray]], which: np.ndarray) -> dict[str, Poses]:
+    """Poses of objects at samples (S,), from world poses (4, 4) in situations, the number of which is `which` (S,)."""
+    out = {}
+    for name in dict.fromkeys(name for x in poses for name in x):
+        X = np.array([x.get(name, _ABSENT) for x in poses])[which]
+        out[name] = X[:, :3, :3], X[:, :3, 3]
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class _Plant:
     """One of the planner's plants: its shapes, and what carries each of its geometries, by id and by index (G,)."""
@@ -265,29 +278,27 @@ class Nearness:
         """A robot with knots q (K, n) at samples of a motion through `modes`."""
         world = self.worlds[robot]
         x = samples.at(q)
-        S, B = len(x), len(world.chain.bodies)
+        S, B, bounds = len(x), len(world.chain.bodies), world.bounds
         R, p = np.empty((S, B, 3, 3)), np.empty((S, B, 3))
         R_load, p_load = np.full((S, 3, 3), np.nan), np.full((S, 3), np.nan)
         screws = np.empty((S, world.chain.n, 6))
-        size = np.full((S, 1), -1e3)
+        # The last sphere is around the load; what is not there has no size.
+        centres = np.zeros((S, len(bounds.radii) + 1, 3))
+        radii = np.tile(np.append(bounds.radii, -1e3), (S, 1))
         of = {s: modes[s].held.get(robot) for s in np.unique(samples.segment).tolist()}
-        for held in dict.fromkeys(of.values()):
-            i = np.flatnonzero(np.isin(samples.segment, [s for s, h in of.items() if h == held]))
-            chain = self._chain(robot, held)
+        chains = {s: self._chain(robot, held) for s, held in of.items()}
+        for chain in dict.fromkeys(chains.values()):
+            i = np.flatnonzero(np.isin(samples.segment, [s for s, c in chains.items() if c is chain]))
             Rs, ps, axes = chain.sweep(x[i])
-            for k in range(B):
-                R[i, k], p[i, k] = Rs[k], ps[k]
+            R[i], p[i] = np.stack(Rs, axis=1), np.stack(ps, axis=1)
             screws[i] = screws_of(chain, len(i), axes)
-            if held is not None:
-                R_WG, p_WG = world.tool.carried(Rs, ps)
-                R_load[i], p_load[i] = R_WG @ held.X_PO[:3, :3], p_WG + R_WG @ held.X_PO[:3, 3]
-                size[i] = world.object_radius[held.object]
-        bounds = world.bounds
-        bodies = [world.chain.index[b] for b in bounds.bodies]
-        centres = p[:, bodies] + (R[:, bodies] @ bounds.centres[..., None])[..., 0]
-        load = np.where(np.isnan(p_load), 0.0, p_load)[:, None]
-        radii = np.concatenate([np.tile(bounds.radii, (S, 1)), size], axis=1)
-        return State(x, np.concatenate([centres, load], axis=1), radii, screws, R, p, R_load, p_load)
+            centres[i, :-1] = bounds.placed(Rs, ps)
+        R_WG, p_WG = world.tool.carried(R.swapaxes(0, 1), p.swapaxes(0, 1))
+        for held in {h for h in of.values() if h is not None}:
+            i = np.flatnonzero(np.isin(samples.segment, [s for s, h in of.items() if h == held]))
+            R_load[i], p_load[i] = R_WG[i] @ held.X_PO[:3, :3], p_WG[i] + R_WG[i] @ held.X_PO[:3, 3]
+            centres[i, -1], radii[i, -1] = p_load[i], world.object_radius[held.object]
+        return State(x, centres, radii, screws, R, p, R_load, p_load)
 
     def rows(
         self,
@@ -315,14 +326,11 @@ class Nearness:
         """What is within `reach` (m) of a robot and its load: itself, the static world, objects at rest."""
         world = self.worlds[robot]
         known = self._plant(world.scene)
-        free: dict[str, Poses] = {}
-        for s in np.unique(samples.segment).tolist():
-            i = np.flatnonzero(samples.segment == s)
-            mode = arrangement.modes[s]
-            for name, X in arrangement.resting(mode).items():
-                R, p = free.setdefault(name, _nowhere(len(samples)))
-                R[i], p[i] = X[:3, :3], X[:3, 3]
-            self._carry(free, world.slot_of, mode.held.get(robot), state, i)
+        segments, which = np.unique(samples.segment, return_inverse=True)
+        modes = [arrangement.modes[s] for s in segments.tolist()]
+        free = _resting([arrangement.resting(mode) for mode in modes], which)
+        for k, mode in enumerate(modes):
+            self._carry(free, world.slot_of, mode.held.get(robot), state, np.flatnonzero(which == k))
         near, open_ones = known.near(len(samples), {robot: state}, free, reach)
         parts = [near]
         for s in np.unique(samples.segment[open_ones]).tolist():
@@ -344,9 +352,8 @@ class Nearness:
     def close(self, spheres: tuple[tuple, tuple], far: float) -> np.ndarray:
         """Samples at which bounding spheres of two robots come within `far` (m)."""
         (ca, ra), (cb, rb) = spheres
-        low_a, high_a = (ca - np.maximum(ra, 0)[..., None]).min(axis=1), (ca + np.maximum(ra, 0)[..., None]).max(axis=1)
-        low_b, high_b = (cb - np.maximum(rb, 0)[..., None]).min(axis=1), (cb + np.maximum(rb, 0)[..., None]).max(axis=1)
-        maybe = np.flatnonzero(np.all(low_a < high_b + far, axis=1) & np.all(low_b < high_a + far, axis=1))
+        (low_a, high_a), (low_b, high_b) = _extent(ca, ra), _extent(cb, rb)
+        maybe = np.flatnonzero(np.all(low_a < high_b + far, axis=0) & np.all(low_b < high_a + far, axis=0))
         if not len(maybe):
             return maybe
         a, b = ca[maybe], cb[maybe]
@@ -437,6 +444,13 @@ class Nearness:
                     change = (screws @ near.wrench[rows][:, :, None])[..., 0]
                     out[rows, columns] += sign[rows, None] * change
         return out
+
+
+def _extent(centres: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest coordinates (3, S) of spheres at samples: centres (S, K, 3), radii (S, K)."""
+    # Reductions over rows of many samples take far less time than over a few spheres each.
+    c, r = np.ascontiguousarray(centres.T), np.maximum(radii.T, 0.0)
+    return (c - r).min(axis=1), (c + r).max(axis=1)
 
 
 def _joined(parts: Sequence[Near]) -> Near:

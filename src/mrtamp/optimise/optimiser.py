@@ -43,11 +43,16 @@ _LINGER, _LODGED, _YIELDS = 5, 0.004, 0.8
 """Steps in which a draft whose robots penetrate by more than that (m) all the time has to reduce it to that share."""
 _SHALLOW = 1e-3
 """Penetration (m) at the program's own samples that makes a finer look pointless."""
+_AHEAD, _LEAST = 0.5, 0.02
+"""Distance (m) of what enters a program, relative to the largest step (rad or m) of a joint in the one before, and the
+least: with all that is farther in it, a program takes up to twice as long."""
+_MISSED = 1e-3
+"""Penetration (m) of what was left out with which a program is solved again, with all there is."""
 _TRUE, _FALSE = 0.7, 0.25
 _GAINING, _STRIDE = 0.01, 0.6
 """As long as every step makes a plan cheaper by that share, that much of the first trust region is kept: some of the
 collisions are left to later, smaller steps."""
-_SETTLED = 0.002
+_SETTLED = 0.001
 """What a step gains less than that share of, if it leads to what grazes something, is mended: before, the next step
 gains more in the time."""
 _GRAZES = 2
@@ -148,6 +153,7 @@ class Optimiser:
         if draft:
             self._best = self._sure = replace(self._best, cost=np.inf)
         self._depths: list[float] = []
+        self._stride = np.inf
         self._rows: CollisionRows | None = None
         self._resample()
 
@@ -255,7 +261,7 @@ class Optimiser:
         if iterate.line is not self._now.line:
             # What violations taught is about steps of the other polyline.
             self.collisions.forget()
-        self._now, self._rows = iterate, None
+        self._now, self._rows, self._stride = iterate, None, np.inf
         self._adopt(iterate)
 
     @property
@@ -279,6 +285,7 @@ class Optimiser:
         solved = self._solve(now, self._rows, self.trust)
         if solved is None:
             return self._reject()
+        stride = float(np.abs(solved.q - now.q).max(initial=0.0))
         demands = self.collisions.demands
         before = self._merit(now, self._rows)
         tolerance = self.problem.collision.tolerance
@@ -297,6 +304,7 @@ class Optimiser:
             self._depths.append(self._rows.deepest(tolerance))
             self.collisions.demands = demands
             return self._reject()
+        self._stride = stride
         deepest = rows.deepest(tolerance)
         where = (candidate.line, candidate.q, candidate.arrangement)
         self._depths.append(deepest)
@@ -332,6 +340,17 @@ class Optimiser:
             self._clear_up(clean)
         self._pace(before, after, self._promise + self._changes, clean or not looked, gaining)
         return gain
+
+    def finish(self) -> None:
+        """No more steps come: what they have led to is mended, if it is cheaper than the best and grazes something."""
+        x, best = self._now, min(self._best.cost, self.to_beat)
+        if self.stuck or self._rows is None or x.cost >= (1 - worth(self.collisions.level)) * best:
+            return
+        violations = self._violations(x, self._rows.clearance)
+        mended = self._mended(x, violations) if violations else None
+        if mended is not None:
+            self._best = mended
+            self._return_to(mended)
 
     def _mended(self, x: Iterate, violations: Sequence[Violations]) -> Iterate | None:
         return self.mending.attempt(x, violations, min(self._best.cost, self.to_beat), self.collisions.level)
@@ -405,6 +424,7 @@ class Optimiser:
 
     def _reject(self) -> float:
         self.trust *= 0.5
+        self._stride = np.inf
         self._settle(self.trust < _SMALLEST)
         return 0.0
 
@@ -432,8 +452,16 @@ class Optimiser:
         lower, upper = self._box(now, trust)
         equal = self._stacked(self._closure.equalities(now.q, now.arrangement), n + count)[0]
         F, g = self._stacked(self._closure.inequalities(now.q, now.arrangement), n + count)
-        linear = Linearised(sparse.csr_array(rows.A @ whole), -rows.gap, equal, F, g, lower, upper)
-        solved = solve(self._reduction, now.q, self.weights, linear, self.collisions.level)
+        A, gap = sparse.csr_array(rows.A @ whole), rows.gap
+
+        def solution(used: np.ndarray) -> tuple[np.ndarray, float] | None:
+            linear = Linearised(sparse.csr_array(A[used]), -gap[used], equal, F, g, lower, upper)
+            return solve(self._reduction, now.q, self.weights, linear, self.collisions.level)
+
+        near = gap < max(_LEAST, _AHEAD * self._stride)
+        solved = solution(near)
+        if solved is not None and np.any(gap[~near] + A[~near] @ solved[0] < -_MISSED):
+            solved = solution(np.ones(len(gap), dtype=bool))
         if solved is None:
             return None
         x, self._promise = solved

@@ -96,7 +96,10 @@ def reduce(line: Polyline, pinned: Mapping[str, np.ndarray]) -> Reduction:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Constraints on the variables x = (z, y): `A x >= b` softly, `C x = 0`, `F x >= g`, and a box."""
+    """Constraints on the variables x = (z, y): `A x >= b`, `C x = 0`, `F x >= g`, and a box.
+
+    Rows of A that do not hold at x = 0 are soft: what is missing has a price.
+    """
 
     A: sparse.csr_array
     b: np.ndarray
@@ -119,8 +122,10 @@ def solve(
     n = len(rows.lower)
     # A row that cannot become active within the trust region is none.
     reach = rows.A.maximum(0) @ rows.lower + rows.A.minimum(0) @ rows.upper
-    active = np.flatnonzero((reach < rows.b) & (np.abs(rows.A).sum(axis=1) > 1e-9))
-    m = len(active)
+    active = (reach < rows.b) & (np.abs(rows.A).sum(axis=1) > 1e-9)
+    # What holds can go on to hold, and needs no slack: a third less work for Clarabel.
+    firm, soft = np.flatnonzero(active & (rows.b <= 0.0)), np.flatnonzero(active & (rows.b > 0.0))
+    m = len(soft)
     program = MathematicalProgram()
     x = program.NewContinuousVariables(n + robots * steps + steps + m)
     length = n
@@ -133,7 +138,8 @@ def solve(
     cost[slack:] = PENALTY * (long + short)
     program.AddLinearCost(cost, x)
     lengths = line.lengths(q).reshape(-1)
-    low = np.concatenate([rows.lower, lengths, np.zeros(steps + m)])
+    # What is bounded from below by a cone needs no bound besides.
+    low = np.concatenate([rows.lower, lengths, np.full(steps, -np.inf), np.zeros(m)])
     high = np.concatenate([rows.upper, lengths, np.full(steps + m, np.inf)])
     dq = np.diff(q, axis=0)
     for row, used, change in reduction.cones:
@@ -146,7 +152,7 @@ def solve(
         b = np.zeros(size + 1)
         b[1:] = dq[k, cols]
         program.AddLorentzConeConstraint(A, b, np.append(x[used], x[length + row]))
-        low[length + row], high[length + row] = 0.0, np.inf
+        low[length + row], high[length + row] = -np.inf, np.inf
     if long > 0:
         each = np.arange(robots * steps)
         entries = (
@@ -156,11 +162,14 @@ def solve(
         order = sparse.csc_matrix(entries, shape=(len(each), robots * steps + steps))
         program.AddLinearConstraint(order, np.full(len(each), -np.inf), np.zeros(len(each)), x[length:slack])
     else:
-        high[span:slack] = 0.0
+        low[span:slack] = high[span:slack] = 0.0
     program.AddBoundingBoxConstraint(low, high, x)
+    if len(firm):
+        A = sparse.csc_matrix(rows.A[firm])
+        program.AddLinearConstraint(A, rows.b[firm], np.full(len(firm), np.inf), x[:n])
     if m:
-        A = sparse.csc_matrix(sparse.hstack([rows.A[active], sparse.eye_array(m)]))
-        program.AddLinearConstraint(A, rows.b[active], np.full(m, np.inf), np.concatenate([x[:n], x[slack:]]))
+        A = sparse.csc_matrix(sparse.hstack([rows.A[soft], sparse.eye_array(m)]))
+        program.AddLinearConstraint(A, rows.b[soft], np.full(m, np.inf), np.concatenate([x[:n], x[slack:]]))
     if rows.C.shape[0]:
         program.AddLinearEqualityConstraint(sparse.csc_matrix(rows.C), np.zeros(rows.C.shape[0]), x[:n])
     if rows.F.shape[0]:

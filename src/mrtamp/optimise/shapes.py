@@ -156,13 +156,16 @@ class Shapes:
         """Samples and numbers of the pairs whose bounding spheres come within `reach` (m)."""
         if not len(pairs):
             return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
-        (rows, i), (columns, j) = (np.unique(side, return_inverse=True) for side in pairs.T)
-        limit = self._bound[pairs].sum(axis=1) + reach
-        a, b = p[:, rows], p[:, columns]
-        square = np.einsum("sgx,sgx->sg", a, a)[:, :, None] + np.einsum("sgx,sgx->sg", b, b)[:, None]
-        gap = (square - 2 * (a @ np.swapaxes(b, 1, 2)))[:, i, j]
-        # The squares of what is far from the origin cost some digits.
-        s, c = np.nonzero(gap < limit**2 + 1e-6)
+        i, j = pairs.T
+        limit = self._bound[i] + self._bound[j] + reach
+        # Coordinate by coordinate, with the samples last: every pass goes over long rows.
+        square = np.zeros((len(pairs), len(p)))
+        for x in np.ascontiguousarray(p.T):
+            apart = x[i]
+            apart -= x[j]
+            apart *= apart
+            square += apart
+        c, s = np.divmod(np.flatnonzero(square < (limit * limit)[:, None]), len(p))
         return s, c
 
 
