@@ -192,8 +192,7 @@ class MotionJudge:
         ends = np.stack([start, start + 1], axis=1)
         normals = np.concatenate([normal, np.full((1, 3), np.nan)])[row[ends, pair[:, None]]]
         stretches = Stretches(start, start + 1, pair, d[ends, pair[:, None]], normals)
-        allowance = Allowance(self.tolerance - self._standing(line, pairs.solids[moved.any(axis=0)]), s)
-        self._bisect(samples, pairs, stretches, allowance, report, exempt, hits)
+        self._bisect(samples, pairs, stretches, report, exempt, hits)
         hits.report(report)
 
     def _open(self, pairs: Pairs, s: np.ndarray, d: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -239,12 +238,14 @@ class MotionJudge:
         samples: Samples,
         pairs: Pairs,
         stretches: Stretches,
-        allowance: Allowance,
         report: Report,
         exempt: Mapping[tuple[str, str], tuple[float, float]],
         hits: _Hits,
     ) -> None:
         """Halve the stretches that their ends do not certify until nothing is left open; note what collides."""
+        if not len(stretches):
+            return
+        allowance = Allowance(self.tolerance - self._standing(samples.line, pairs), samples.s)
         stretches = stretches.unsettled(samples, pairs, allowance)
         while len(stretches) and not (hits and report.first_only):
             # Stretches of several pairs share one sample in the middle.
@@ -261,10 +262,11 @@ class MotionJudge:
             stretches = stretches.where(free).halves(at[free], d[free], normal[free])
             stretches = stretches.unsettled(samples, pairs, allowance)
 
-    def _standing(self, line: Timeline, moving: np.ndarray) -> float:
-        """Penetration (m) of all pairs but the `moving` ones (P, 2), which is the same all the way."""
+    def _standing(self, line: Timeline, pairs: Pairs) -> float:
+        """Penetration (m) of all that do not move towards each other, which is the same all the way."""
         if self.tolerance <= 0.0:
             return 0.0
+        moving = pairs.solids[line.travel[-1] @ pairs.rates.T > 0.0]
         others = line.motion.allowed | set(map(tuple, moving.tolist()))
         query = self.world.query(line.state(np.zeros(1))[0][0])
         return sum(depth for pair, depth in self.world.penetrations(query).items() if pair not in others)

@@ -466,11 +466,13 @@ class Portfolio:
 
     def _beware(self, lodged: Sketch) -> None:
         """Give up other drafts with the ways that most likely keep this one in collision."""
-        if lodged.guilty:
-            self.crowded.add(lodged.guilty)
-            guilty = lodged.guilty
-            alike = {e for e in self._entries if e.draft and e.sketch is not None and guilty <= e.sketch.ways}
-            self._entries = [e for e in self._entries if e.sketch is lodged or e not in alike]
+        if not lodged.guilty:
+            return
+        self.crowded.add(lodged.guilty)
+        others = [e for e in self._entries if e.draft and e.sketch is not lodged]
+        for entry in others:
+            if entry.sketch is not None and lodged.guilty <= entry.sketch.ways:
+                self._entries.remove(entry)
 
     def settled(self) -> list[Plan]:
         """Plans whose refinement has converged since this was last asked."""

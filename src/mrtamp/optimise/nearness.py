@@ -17,7 +17,7 @@ from pydrake.geometry import GeometryId, QueryObject, SignedDistancePair
 from pydrake.systems.framework import Context
 
 from mrtamp.collision import Collision
-from mrtamp.kinematics import Chain
+from mrtamp.kinematics import Chain, matrix
 from mrtamp.modes import Attachment, Mode
 from mrtamp.optimise.choices import Arrangement
 from mrtamp.optimise.screws import cross, screws_of, transported, upstream
@@ -214,15 +214,12 @@ def _nowhere(n: int) -> Poses:
     return np.zeros((n, 3, 3)), np.full((n, 3), np.nan)
 
 
-_ABSENT = np.full((4, 4), np.nan)
-_ABSENT[:3, :3] = 0.0
-
-
 def _resting(poses: Sequence[Mapping[str, np.ndarray]], which: np.ndarray) -> dict[str, Poses]:
     """Poses of objects at samples (S,), from world poses (4, 4) in situations, the number of which is `which` (S,)."""
     out = {}
+    [absent] = matrix(*_nowhere(1))
     for name in dict.fromkeys(name for x in poses for name in x):
-        X = np.array([x.get(name, _ABSENT) for x in poses])[which]
+        X = np.array([x.get(name, absent) for x in poses])[which]
         out[name] = X[:, :3, :3], X[:, :3, 3]
     return out
 

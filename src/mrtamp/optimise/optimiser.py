@@ -349,8 +349,8 @@ class Optimiser:
         violations = self._violations(x, self._rows.clearance)
         mended = self._mended(x, violations) if violations else None
         if mended is not None:
-            self._best = mended
-            self._return_to(mended)
+            self._best = self._now = mended
+            self._rows = None
 
     def _mended(self, x: Iterate, violations: Sequence[Violations]) -> Iterate | None:
         return self.mending.attempt(x, violations, min(self._best.cost, self.to_beat), self.collisions.level)
