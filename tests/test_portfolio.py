@@ -13,12 +13,10 @@ from discs import Errands
 
 from mrtamp.check import check_plan
 from mrtamp.optimise import Optimiser
-from mrtamp.options import Skeleton
 from mrtamp.plan import Plan
 from mrtamp.planner import Options, Planner
 from mrtamp.portfolio import _PATIENCE, _PLENTY, SIZE, Portfolio
 from mrtamp.portfolio_entry import Entry, Sketch
-from mrtamp.skeleton_guidance import Proposal
 from mrtamp.transitions.ways import Way
 
 STARTS: Mapping[str, XY] = {"a": (-1, 1), "b": (-1, -1)}
@@ -139,29 +137,31 @@ def test_drafts_that_are_free_count_as_plans_and_make_room_for_themselves(tmp_pa
     assert best is None or check_plan(best).ok
 
 
-def test_a_plan_is_shortened_before_it_is_shown_unless_the_judge_objects(
+def test_a_plan_is_refined_until_it_is_cheap_enough_unless_the_judge_objects(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     planner = planner_for(tmp_path)
     plan = roundabout(planner, 0.6)
-    shortened = planner.portfolio.shortened(plan, 40)
-    assert shortened.cost < 0.9 * plan.cost
-    assert check_plan(shortened).ok
-    assert planner.portfolio.shortened(plan, 0) is plan, "nothing was tried"
+    refined = planner.portfolio.refined(plan, 0.9 * plan.cost, 8)
+    assert refined.cost < 0.9 * plan.cost
+    assert check_plan(refined).ok
+    assert planner.portfolio.refined(plan, 0.9 * plan.cost, 0) is plan, "nothing was tried"
+    assert planner.portfolio.refined(plan, 0.1 * plan.cost, 8) is plan, "it cannot be had that cheap"
     monkeypatch.setattr(planner.incumbent, "accepted", lambda *_: None)
-    assert planner.portfolio.shortened(plan, 40) is plan
+    assert planner.portfolio.refined(plan, 0.9 * plan.cost, 8) is plan
 
 
-@pytest.mark.parametrize(("promised", "shortened"), [(0.9, False), (0.4, True)])
+@pytest.mark.parametrize(("promised", "refined"), [(0.9, False), (0.4, True), (np.inf, False)])
 def test_only_a_first_plan_that_is_far_dearer_than_promised_has_to_wait(
-    tmp_path: Path, promised: float, shortened: bool
+    tmp_path: Path, promised: float, refined: bool
 ) -> None:
     planner = planner_for(tmp_path)
     plan = roundabout(planner, 0.6)
-    proposal = Proposal(Skeleton({}, (), promised * plan.cost, 0.0, {}, ()), (), (), 0)
-    assert (planner.realisation._shown_first(plan, proposal) is plan) is not shortened
-    planner.realisation.shortening = False
-    assert planner.realisation._shown_first(plan, proposal) is plan
+    realisation = planner.realisation
+    realisation._promised = promised * plan.cost
+    assert (realisation.presentable(plan) is plan) is not refined
+    realisation.refines = False
+    assert realisation.presentable(plan) is plan
 
 
 def test_what_the_same_search_finds_takes_the_place_of_what_has_hardly_begun(tmp_path: Path) -> None:

@@ -90,7 +90,7 @@ def _slots(problem: Problem, prefix: str) -> tuple[dict[str, MovableObject], dic
 class Posed(NamedTuple):
     """A robot at N configurations: N stacks of its beads and a ball around what it holds, and the poses (N, 7) of that.
 
-    `loads` is None where it holds nothing, see `load_poses`.
+    Where it stands still one stack will do.  `loads` is None where it holds nothing, see `load_poses`.
     """
 
     balls: Balls

@@ -101,8 +101,10 @@ class Insertion:
         self.stuck: int | None = None
         self.schedule: SpaceTime | None = None
         self._rows = RoadmapRows(roadmaps, collision, validity)
-        # Of one attempt: the transitions at its stops as far as they were asked for, and its `variety`.
+        # Of one attempt: the transitions at its stops as far as they were asked for, the ways between vertices that
+        # need not keep clear of other robots, and its `variety`.
         self._known: dict[tuple[int, Mode], Candidate | None] = {}
+        self._ways: dict[tuple[str, int, int, Mode], list[int]] = {}
         self._variety = 0.0
         self._effort = _EFFORTS[-1]
 
@@ -141,6 +143,7 @@ class Insertion:
         self.stuck = self.schedule = None
         self._variety = variety
         self._known.clear()
+        self._ways.clear()
         self._rows.forget_if_full()
         q = {r: self.roadmaps[r].q[v] for r, v in start.items()}
         time = SpaceTime(self._rows.clearances, q, [root], alone=alone)
@@ -372,8 +375,13 @@ class Insertion:
         if around:
             path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, rounds=_AROUND, seek=True)
         else:
+            key = (robot, state.at[robot], v, state.mode)
             detour = self.rng.random() < self._variety
-            path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, detour=detour, connect=connect)
+            path = None if detour else self._ways.get(key)
+            if path is None:
+                path, _ = self.steering.path(state.mode, at, robot, v, ignore=others, detour=detour, connect=connect)
+                if path is not None and not detour:
+                    self._ways[key] = path
         if path is None:
             return None
         return Leg({robot: self._rows.path(robot, path, state.time.at[robot])}, state.mode)

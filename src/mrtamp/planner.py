@@ -167,7 +167,7 @@ class Planner:
             self._to_beat,
             descent=Descent(self.sampler, self.portfolio.nearness) if self._uses("way-descent") else None,
             drafts=self._uses("drafts"),
-            shortening=self._uses("refinement"),
+            refining=self._uses("refinement"),
         )
         self._effort = Effort(
             {"search": 0.05, "skeletons": 0.25, "refinement": 0.1},
@@ -427,6 +427,8 @@ class Planner:
                     # Whatever is wrong is not a step that could be withdrawn.
                     self.growth.orbits.remove(node)
                 return False
+        if self.best is None:
+            plan = self.realisation.presentable(plan)
         better = self._offer(plan)
         if better:
             self.orbit_guidance.path = [g[0].orbit for g in groups]

@@ -31,6 +31,8 @@ _SHORTENING = 1
 """Proposals, per robot and transition, after which shortening gives way to convex programming."""
 _ALONE = 1200
 """The same where there is no convex programming."""
+_CLEARANCE = 0.015
+"""Clearance (m) with which a plan is free of collision after the first programs, all but always."""
 _STALE = 0.004
 """Relative gain of a turn below which shortening has done its part."""
 _LUCK = 0.93
@@ -139,12 +141,15 @@ class Portfolio:
         self._admit([entry])
         return True
 
-    def shortened(self, plan: Plan, proposals: int) -> Plan:
-        """A checked plan after so many shortcuts were tried on it; the same one if the judge objects to the outcome."""
-        work = Refiner(plan, self.validity, self.rng, RESOLUTION)
-        if not work.improve(proposals):
-            return plan
-        return self.incumbent.accepted(work.segments(), work.transitions) or plan
+    def refined(self, plan: Plan, enough: float, programs: int) -> Plan:
+        """A checked plan after convex programs, so many at most, have made it cost less than `enough`.
+
+        Where they do not, or the judge objects to the outcome, it is the same one.
+        """
+        work = self._optimiser(Entry(plan), clearance=_CLEARANCE)
+        while work.steps < programs and work.cost >= enough and not (work.converged or self.deadline.passed):
+            work.step()
+        return (self.incumbent.accepted(work.segments(), work.transitions) or plan) if work.cost < enough else plan
 
     def worth_drafting(self, incumbent: float) -> float:
         """Estimate below which drafts may come to beat the incumbent, from what became of those so far."""
@@ -403,7 +408,7 @@ class Portfolio:
         entry.refiner = None
         entry.optimiser = self._optimiser(entry)
 
-    def _optimiser(self, entry: Entry) -> Optimiser:
+    def _optimiser(self, entry: Entry, clearance: float = 0.0) -> Optimiser:
         return Optimiser(
             self.problem,
             self.nearness,
@@ -415,6 +420,7 @@ class Portfolio:
             # Finer steps beside bends gain little: they wait until a plan has proved itself.
             levels=entry.fineness,
             level=min(entry.fineness, 1),
+            clearance=clearance,
             deadline=self.deadline,
         )
 

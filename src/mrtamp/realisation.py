@@ -25,6 +25,8 @@ from mrtamp.transitions.ways import Way
 
 _FIRST_WAYS, _MORE_WAYS = (80, 14), (64, 20)
 """IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
+_FIRST_GROWTHS = 3
+"""How often ways are sampled before there is a plan, at most, as long as a task has fewer than are kept at a time."""
 _FIRST_SHORTENED, _SHORTENED = 16, 40
 """Of these, how many are shortened."""
 _GROWTHS, _SLOW_GROWTHS, _WORTH_GROWING = 32, 2, 0.02
@@ -53,8 +55,9 @@ _DETERRENT = 100.0
 """By how many times dearer a skeleton seems for a conflict of 1 in its draft."""
 _POOR = 2.0
 """A first realisation that costs so many times what its skeleton promised is not the only one."""
-_DEAR, _SHORTCUTS = 2.1, 40
-"""If the best of them still costs so many times that, so many shortcuts are tried on it before it counts as a plan."""
+_DEAR, _PROGRAMS = 2.1, 8
+"""If the best of them still costs so many times that, it has so many convex programs to become cheaper before it counts
+as a plan."""
 _MENDINGS = 8
 """Times that a realisation is judged, steps to which the judge objected being forbidden before the next."""
 _MANY = 12
@@ -76,7 +79,7 @@ class Realisation:
     to_beat : cost that a skeleton has to promise less than.
     descent : shortens ways along their strata; None: they stay as they were sampled.
     drafts : whether skeletons are also put under refinement as they are.
-    shortening : whether a dear first plan is shortened before it counts.
+    refining : whether a dear first plan is refined before it counts.
 
     Attributes
     ----------
@@ -94,7 +97,7 @@ class Realisation:
         *,
         descent: Descent | None = None,
         drafts: bool = True,
-        shortening: bool = True,
+        refining: bool = True,
     ) -> None:
         self.growth = growth
         self.skeletons = skeletons
@@ -104,9 +107,11 @@ class Realisation:
         self.to_beat = to_beat
         self.descent = descent
         self.drafts = drafts and portfolio.convex
-        self.shortening = shortening
+        self.refines = refining and portfolio.convex
         self.undrafted = self.drafts
         self._turn = 0
+        self._attempted = False
+        self._promised = np.inf
         self._early = self._urgent = False
         self._drafted = _Drafted()
 
@@ -117,16 +122,19 @@ class Realisation:
         -------
         A checked plan that the tree does not have yet, a goal node of the tree, or None; also where drafts were made.
         """
-        first = self._first
+        first, hasty = self._first, not self._attempted
+        self._attempted = True
         self._grow()
-        self.skeletons.update_bound(hasty=first)
+        self.skeletons.update_bound(hasty=hasty)
         if not first and self.drafts and self._draft():
             return None
         tries = 0
         while tries < _REALISATIONS:
             failed: set[Way] = set()
             inserted: list[tuple[float, Timed, SpaceTime, Proposal]] = []
-            for proposal in self.skeletons.propose(self.to_beat(), _QUICK if first else _THOROUGH, hasty=first):
+            for proposal in self.skeletons.propose(self.to_beat(), _QUICK if first else _THOROUGH, hasty=hasty):
+                if not proposal.hasty:
+                    self._promised = min(self._promised, proposal.skeleton.cost)
                 if not failed.isdisjoint(proposal.ways):
                     # The guidance has learnt something about these since.
                     continue
@@ -153,17 +161,17 @@ class Realisation:
                 plan = self._judged(timed, schedule, proposal)
                 if plan is not None:
                     self.skeletons.realised(proposal)
-                    return self._shown_first(plan, proposal) if first else plan
+                    return self.presentable(plan) if first else plan
                 failed |= self.skeletons.refused(proposal)
             if not failed:
                 return None
         return None
 
-    def _shown_first(self, plan: Plan, proposal: Proposal) -> Plan:
-        """The first plan, shortened a little where it is far dearer than its skeleton promised and that is quick."""
-        few = len(proposal.stops) <= _MANY and not proposal.hasty
-        dear = few and plan.cost > _DEAR * proposal.skeleton.cost
-        return self.portfolio.shortened(plan, _SHORTCUTS) if dear and self.shortening else plan
+    def presentable(self, plan: Plan) -> Plan:
+        """The first plan, refined a little where it is far dearer than skeletons promised and that is quick."""
+        enough = _DEAR * self._promised
+        dear = plan.cost > enough and len(plan.transitions) <= _MANY
+        return self.portfolio.refined(plan, enough, _PROGRAMS) if dear and self.refines else plan
 
     def _judged(self, timed: Timed | None, schedule: SpaceTime | None, proposal: Proposal) -> Plan | None:
         """The plan of a realisation if the judge accepts it, after some attempts without the steps it objected to."""
@@ -184,7 +192,13 @@ class Realisation:
     def _grow(self) -> None:
         """Sample more ways; where objects are handed over, until more of them hardly make skeletons cheaper."""
         if self._first:
-            self.skeletons.grow(*_FIRST_WAYS)
+            for _ in range(_FIRST_GROWTHS):
+                self.skeletons.grow(*_FIRST_WAYS)
+                if (
+                    self.skeletons.hands_over
+                    or min(self.skeletons.counts.values(), default=_FIRST_WAYS[1]) >= _FIRST_WAYS[1]
+                ):
+                    break
             if self.descent is not None:
                 self.skeletons.shorten(self.descent, _FIRST_SHORTENED)
             return

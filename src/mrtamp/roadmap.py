@@ -113,10 +113,16 @@ class Roadmap:
         most = min(before, prm_star_neighbours(before + len(q), self.n_dof))
         far, old = cKDTree(self._open_q[:before]).query(q, k=np.arange(1, most + 1))
         among = cdist(q, q)
+        joined = []
         for m, x in enumerate(q):
-            i = self.add_vertex(x, connect=False)
-            self._join(i, np.concatenate([old[m], np.arange(before, before + m)]), np.append(far[m], among[m, :m]))
-            self._open_up(i)
+            self._open_up(self.add_vertex(x, connect=False))
+            others, distance = np.append(old[m], np.arange(before, before + m)), np.append(far[m], among[m, :m])
+            nearest = self._nearest(distance, before + m)
+            joined.append((others[nearest], distance[nearest]))
+        opened = np.array(self._open, dtype=np.int32)
+        many = [len(others) for others, _ in joined]
+        to, w = (np.concatenate(x) for x in zip(*joined, strict=True))
+        self._add_edges(opened[to], np.repeat(opened[before:], many), w)
 
     def _open_up(self, i: int) -> None:
         n = len(self._open)
@@ -127,16 +133,16 @@ class Roadmap:
 
     def _connect(self, i: int) -> None:
         n = len(self._open)
-        if n:
-            self._join(i, np.arange(n), np.linalg.norm(self._open_q[:n] - self._q[i], axis=1))
-
-    def _join(self, i: int, others: np.ndarray, distance: np.ndarray) -> None:
-        """Edges to the k nearest open vertices, which are among `others` (their numbers in the list of open ones)."""
-        k = prm_star_neighbours(len(self._open), self.n_dof)
-        nearest = np.argpartition(distance, k)[:k] if k < len(distance) else np.arange(len(distance))
-        nearest = nearest[np.argsort(distance[nearest], kind="stable")]
-        for j, d in zip(others[nearest].tolist(), distance[nearest].tolist(), strict=True):
+        distance = np.linalg.norm(self._open_q[:n] - self._q[i], axis=1)
+        nearest = self._nearest(distance, n)
+        for j, d in zip(nearest.tolist(), distance[nearest].tolist(), strict=True):
             self._add_edge(self._open[j], i, d)
+
+    def _nearest(self, distance: np.ndarray, n: int) -> np.ndarray:
+        """Which of the vertices at some distances, the nearest first, a new one is joined to when n are open."""
+        k = prm_star_neighbours(n, self.n_dof)
+        nearest = np.argpartition(distance, k)[:k] if k < len(distance) else np.arange(len(distance))
+        return nearest[np.argsort(distance[nearest], kind="stable")]
 
     def edge(self, a: int, b: int) -> int:
         """The edge between two vertices, made if need be; (a, a) is the degenerate edge of standing at a."""
@@ -157,9 +163,7 @@ class Roadmap:
 
     def _add_edge(self, a: int, b: int, length: float) -> int:
         """A new edge, a <= b."""
-        if self.n_edges == len(self._w):
-            self._ends = np.concatenate([self._ends, np.empty_like(self._ends)])
-            self._w = np.concatenate([self._w, np.empty_like(self._w)])
+        self._make_room(1)
         e = self.n_edges
         self._ends[e, 0], self._ends[e, 1], self._w[e] = a, b, length
         self.n_edges += 1
@@ -173,6 +177,28 @@ class Roadmap:
         if self.inserted is not None:
             self.inserted(self.name, e)
         return e
+
+    def _add_edges(self, a: np.ndarray, b: np.ndarray, length: np.ndarray) -> None:
+        """New edges (m,) between different vertices, a < b, as by `_add_edge` one after another."""
+        self._make_room(len(a))
+        fresh = np.arange(self.n_edges, self.n_edges + len(a), dtype=np.int32)
+        self._ends[fresh, 0], self._ends[fresh, 1], self._w[fresh] = a, b, length
+        self.n_edges += len(a)
+        at, across = self._ends[fresh].ravel(), self._ends[fresh, ::-1].ravel()
+        order = np.argsort(at, kind="stable")
+        vertices, first = np.unique(at[order], return_index=True)
+        for v, part in zip(vertices.tolist(), np.split(order, first[1:]), strict=True):
+            self._adjacent[v].frombytes(across[part].tobytes())
+            self._incident[v].frombytes(fresh[part // 2].tobytes())
+        self._arcs.forget()
+        if self.inserted is not None:
+            for e in fresh.tolist():
+                self.inserted(self.name, e)
+
+    def _make_room(self, more: int) -> None:
+        while self.n_edges + more > len(self._w):
+            self._ends = np.concatenate([self._ends, np.empty_like(self._ends)])
+            self._w = np.concatenate([self._w, np.empty_like(self._w)])
 
     def length(self, a: int, b: int) -> float:
         """Length (rad) of the straight motion between two vertices."""
@@ -271,6 +297,10 @@ class _Arcs:
         self._used = np.zeros(0, dtype=np.int64)
         self._target = np.zeros(0, dtype=np.int32)
         self._edge = np.zeros(0, dtype=np.int32)
+        self._stale = True
+
+    def forget(self) -> None:
+        """Lay the rows out anew when they are asked for next: there are many new edges."""
         self._stale = True
 
     def add(self, a: int, b: int, e: int) -> None:

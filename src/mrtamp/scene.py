@@ -265,11 +265,13 @@ def _joints(plant: MultibodyPlant, instances: Instances) -> list[Joint]:
 
 
 def _body(plant: MultibodyPlant, instances: Instances, name: str) -> RigidBody:
-    return next(body for body in _bodies(plant, instances) if body.name() == name)
+    instance = next(i for i in instances if plant.HasBodyNamed(name, i))
+    return plant.GetBodyByName(name, instance)
 
 
 def _joint(plant: MultibodyPlant, instances: Instances, name: str) -> Joint:
-    return next(joint for joint in _joints(plant, instances) if joint.name() == name and joint.num_positions())
+    found = (plant.GetJointByName(name, i) for i in instances if plant.HasJointNamed(name, i))
+    return next(joint for joint in found if joint.num_positions())
 
 
 def gripper_bodies(plant: MultibodyPlant, in_scene: RobotInScene) -> list[RigidBody]:

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-import networkx as nx
 import numpy as np
 
 from mrtamp.connect import Connector
@@ -352,21 +351,22 @@ class SkeletonGuidance:
     def propose(self, below: float = np.inf, effort: int = 300, *, hasty: bool = False) -> Iterator[Proposal]:
         """Skeletons whose estimate is less than `below`, cheapest first, those realised before held back a little.
 
-        `effort` bounds the search among orders where they are too many for exact methods.  `hasty`: lengths are
-        measured on the roadmaps, which takes time, only where there is more than one skeleton to choose from.
+        `effort` bounds the search among orders where they are too many for exact methods.  `hasty`: ways are taken to
+        be straight, because it takes time to measure them on the roadmaps.
         """
         sets = self._options()
         if sets is None or not self.applies:
             return
-        hasty = hasty and self._determined(sets)
+        distance = self._distance(sets)
         found = skeletons(
             *self._question(sets, penalised=True),
             limit=_LIMIT,
             rng=self.rng,
-            distance=None if hasty else self._distance(sets),
+            distance=None if hasty else distance,
             effort=effort,
         )
         found.sort(key=lambda x: x.cost * (1 + _REPEATED * self._realised[x.order]))
+        hasty = hasty and distance is not None
         for skeleton in found:
             if skeleton.cost >= min(below, FAR):
                 continue
@@ -377,25 +377,21 @@ class SkeletonGuidance:
     @property
     def has_choice(self) -> bool:
         """Whether there is not just one way for every task."""
-        known = Counter[str]()
-        for (item, _), ways in self.ways.of.items():
-            known[item] += len(ways)
-        counts = [known[item] for item in self.items]
-        counts += [len(self.sampler.reaching.stands(s.name)) for s in self.problem.subgoals]
+        counts = [*self.counts.values(), *(len(self.sampler.reaching.stands(s.name)) for s in self.problem.subgoals)]
         return any(n != 1 for n in counts)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """How many ways there are to bring every object where it belongs, whoever does it."""
+        out = Counter[str](dict.fromkeys(self.items, 0))
+        for (item, _), ways in self.ways.of.items():
+            out[item] += len(ways)
+        return out
 
     @property
     def kinds(self) -> int:
         """Number of sets of ways that grow: one for every task and the robots that may do it."""
         return len(self.ways.of)
-
-    def _determined(self, sets: Mapping[str, list[list[Way]]]) -> bool:
-        """Whether there is one way for every task and one order of them all."""
-        if self.has_choice or any(len(options[0][0].stops) > 1 for options in sets.values()):
-            return False
-        order = nx.DiGraph([(a, b) for (a, _), (b, _) in self._precedence()])
-        order.add_nodes_from(sets)
-        return nx.is_directed_acyclic_graph(order) and nx.dag_longest_path_length(order) == len(sets) - 1
 
     def _distance(self, sets: Mapping[str, list[list[Way]]]) -> Distance | None:
         """Lengths of roadmap paths where stops are few and stand on the roadmaps; else None: straight lines."""
@@ -458,7 +454,7 @@ class SkeletonGuidance:
         sets = self._options()
         if sets is None or not self.applies:
             return
-        distance = None if hasty and self._determined(sets) else self._distance(sets)
+        distance = None if hasty else self._distance(sets)
         bound = lower_bound(*self._question(sets, penalised=False), distance=distance)
         self.bound = bound.value if bound.value < FAR else None
 

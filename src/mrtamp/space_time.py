@@ -188,15 +188,20 @@ class Clearances:
         return hit < 0
 
     def _along(self, robot: str, move: Move, held: Attachment | None, n: int) -> tuple[np.ndarray, Posed]:
-        """Samples (n, dof) of a move in bisection order, and the robot there."""
-        key = (robot, move.a, move.b, held, n)
+        """Samples (n, dof) of a move in bisection order, and the robot there: one pose will do where it stands."""
+        stands = move.a == move.b
+        key = (robot, move.a, move.b, held, 1 if stands else n)
         known = self._samples.get(key)
         if known is None:
-            t = np.linspace(0, 1, n)[bisection_order(n)][:, None]
+            t = np.linspace(0, 1, key[-1])[bisection_order(key[-1])][:, None]
             q = (1 - t) * self.tables[robot][move.a] + t * self.tables[robot][move.b]
             known = (q, self.worlds[robot].posed(q, held))
             self._samples[key] = known
-        return known
+        q, posed = known
+        if not stands or n == 1:
+            return known
+        loads = None if posed.loads is None else np.broadcast_to(posed.loads, (n, posed.loads.shape[1]))
+        return np.broadcast_to(q, (n, q.shape[1])), Posed(posed.balls, loads)
 
     def among(self, robot: str, move: Move, held: Attachment | None, mode: Mode) -> bool:
         """Whether a move keeps clear of the objects that rest in `mode` but not in the mode it was checked in."""

@@ -19,6 +19,8 @@ from mrtamp.roadmap import Roadmap
 
 _GLANCES = (0.5, 0.25, 0.75)
 """Where on its edges a path is looked at, besides the vertices, before any edge is validated."""
+_BESIDE = 16
+"""Edges of either end of an edge found to be blocked that are looked at beside that place."""
 _SLACK = 0.012
 """Clearance (m) of bounding spheres below which Drake is asked: padding plus half a step."""
 
@@ -143,9 +145,11 @@ class Validity:
                 return False
             if known is None:
                 unknown.append((item, factor))
-        unknown = self._cull(robot, e, held, unknown)
-        if verdict is True and not unknown:
-            return True
+        if verdict is True:
+            # Where Drake has to be asked anyway, it is not asked about less.
+            unknown = self._cull(robot, e, held, unknown)
+            if not unknown:
+                return True
         return self._ask(robot, e, held, static, unknown)
 
     def _cull(
@@ -215,7 +219,8 @@ class Validity:
     def glance(self, robot: str, edges: Sequence[int], mode: Mode) -> list[int]:
         """Edges that a few samples of some `edges`, the first of which matter most, show to be blocked in `mode`.
 
-        Where the robot cannot even be at one of their vertices, all edges of that vertex are.
+        Where the robot cannot even be at one of their vertices, all edges of that vertex are; where it cannot be
+        between two, some that pass by there most likely are, too.
         """
         roadmap, held = self.roadmaps[robot], mode.held.get(robot)
         world, static = roadmap.world, self.known(mode, (robot, held, None))
@@ -231,19 +236,49 @@ class Validity:
         vertices = list(dict.fromkeys(roadmap.ends[open_].ravel().tolist()))
         a, b = (roadmap.q[roadmap.ends[open_, k]] for k in (0, 1))
         q = np.concatenate([roadmap.q[vertices], *(a + t * (b - a) for t in _GLANCES)])
-        rows = world.rows(q, held, {item.name: item.X_WO for item, _ in factors})
+        objects = {item.name: item.X_WO for item, _ in factors}
+        rows = world.rows(q, held, objects)
         i = world.first_hit(rows)
         if i < 0:
             return []
         if i < len(vertices):
             around = roadmap.arcs(vertices[i])[1].tolist()
-            found = [e for e in around if self._contact(roadmap, e, held) == (None, None)]
+            found = [(rows[i], [e for e in around if self._contact(roadmap, e, held) == (None, None)])]
         else:
-            found = [open_[(i - len(vertices)) % len(open_)]]
-        for factor in self._guilty(world, rows[i], static, factors):
-            for e in found:
-                factor.put(e, False)
-        return found
+            e = open_[(i - len(vertices)) % len(open_)]
+            labels = [static, *(factor for _, factor in factors)]
+            others, q = self._beside(roadmap, e, q[i], held, labels)
+            beside = world.rows(q, held, objects)
+            found = [(rows[i], [e]), *((beside[k], [others[k]]) for k in np.flatnonzero(world.hits(beside)))]
+        for row, blocked in found:
+            for factor in self._guilty(world, row, static, factors):
+                for e in blocked:
+                    factor.put(e, False)
+        return [e for _, blocked in found for e in blocked]
+
+    def _beside(
+        self, roadmap: Roadmap, e: int, q: np.ndarray, held: Attachment | None, labels: Sequence[Label]
+    ) -> tuple[list[int], np.ndarray]:
+        """Edges (k,) that share an end with e and pass near to q (n,) on it, and where they do (k, n).
+
+        Those that are blocked by what any of `labels` stands for are left out.
+        """
+
+        def asked(f: int) -> bool:
+            return not any(f in label.hit for label in labels) and self._contact(roadmap, f, held) == (None, None)
+
+        found, passing = [], [np.zeros((0, roadmap.n_dof))]
+        for v in roadmap.ends[e].tolist():
+            there, edges = roadmap.arcs(v)
+            way = roadmap.q[there] - roadmap.q[v]
+            length = np.linalg.norm(way, axis=1)
+            reach = float(np.linalg.norm(q - roadmap.q[v]))
+            longer = [k for k, f in enumerate(edges.tolist()) if length[k] > reach and f != e and asked(f)]
+            x = roadmap.q[v] + way[longer] * (reach / length[longer])[:, None]
+            nearest = np.argsort(np.linalg.norm(x - q, axis=1), kind="stable")[:_BESIDE]
+            found += edges[longer][nearest].tolist()
+            passing.append(x[nearest])
+        return found, np.concatenate(passing)
 
     def _contact(self, roadmap: Roadmap, e: int, held: Attachment | None) -> tuple[str | None, str | None]:
         """The body that the load may touch along an edge that ends where it is lifted or put down, and its slot."""

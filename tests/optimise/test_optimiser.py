@@ -52,18 +52,20 @@ def discs(folder: Path, **keys) -> Problem:
     return replace(disc_problem(folder), **{"subgoals": (), "statics": (), "goal": (), **keys})
 
 
-def test_robots_pass_each_other_more_closely_than_the_search_would_let_them(tmp_path: Path) -> None:
-    """Padding is for motion between samples of the search; here the judge says what is free."""
+@pytest.mark.parametrize("clearance", [0.0, 0.05])
+def test_robots_pass_each_other_as_closely_as_they_may(tmp_path: Path, clearance: float) -> None:
+    """Padding is for motion between samples of the search; here the judge says what is free, or more is asked for."""
     problem = arena(tmp_path, {"a": (-1, 0), "b": (1, 0)}, {"a": (1, 0), "b": (-1, 0)})
     e = Errands(problem).move(b=(0.2, -0.6)).move(a=(-0.2, 0.5)).move(a=(1, 0)).move(b=(-1, 0))
-    scp = optimiser(e.plan())
+    scp = optimiser(e.plan(), clearance=clearance)
     run(scp, 60)
     assert judged(scp).ok
     [segment] = scp.segments()
     t = np.linspace(0, 1, 50)[:, None]
     a, b = (np.concatenate([x + t * (y - x) for x, y in pairwise(segment.q[r])]) for r in ("a", "b"))
     gap = np.linalg.norm(a - b, axis=1).min() - 2 * RADIUS
-    assert 0 < gap < PADDING, "two paddings have no place in between"
+    assert gap > clearance / 2, "it is asked for at samples"
+    assert (0 < gap < PADDING) == (clearance == 0.0), "two paddings have no place in between"
 
 
 def test_what_is_far_from_being_worth_it_is_not_looked_at_closely(

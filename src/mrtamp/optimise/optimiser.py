@@ -91,6 +91,8 @@ class Optimiser:
     slide : whether transitions may slide along their strata; otherwise their configurations stay as they are.
     draft : whether robots may still collide with each other in what is given.
     fixed_end : whether all robots end where they do, since it is a piece of a plan.
+    clearance : distance (m) that is asked for at all samples: the more, the sooner a step leads to what is free between
+    them, too.
     to_beat : cost below which it is worth to mend what grazes something; it may be changed on the way.
     deadline : when mending, which takes longer than a program, is given up.
 
@@ -116,6 +118,7 @@ class Optimiser:
         slide: bool = True,
         draft: bool = False,
         fixed_end: bool = False,
+        clearance: float = 0.0,
         to_beat: float = np.inf,
         deadline: Deadline | None = None,
     ) -> None:
@@ -128,6 +131,7 @@ class Optimiser:
         self.levels = levels
         self.slide = slide
         self.fixed_end = fixed_end
+        self.clearance = clearance
         self.to_beat = to_beat
         self.steps = 0
         self._first_trust = first_trust(nearness)
@@ -143,6 +147,7 @@ class Optimiser:
         self._promise = 0.0
         self.collisions = Collisions(self.nearness, tolerance)
         self.collisions.level = level
+        self.collisions.pad = clearance
         self._changes = self.weights.of_changes(a.kind for t in transitions for a in t.actions)
         self.choices = Choices(problem, [s.mode for s in segments], transitions, families if slide else {})
         if not slide:
@@ -395,7 +400,8 @@ class Optimiser:
         self._ask_for(pad)
 
     def _ask_for(self, pad: float) -> None:
-        """Clearance (m) that is asked for everywhere on top."""
+        """Clearance (m) that is asked for everywhere, on top of what is asked for in any case."""
+        pad += self.clearance
         if self._rows is not None:
             self._rows = self._rows.stricter(pad - self.collisions.pad)
         self.collisions.pad = pad
