@@ -17,6 +17,8 @@ from mrtamp.optimise.screws import cross
 _TOUCHING = 1e-7
 """Distance (m) of two cores below which their direction says nothing."""
 _TINY = 1e-12
+_PROVED = 1e-9
+"""Distance (m) up to which two bounds of a distance are held to be the same."""
 _SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 _EDGES = [(a, b) for a, b in itertools.combinations(range(8), 2) if np.sum(_SIGNS[a] != _SIGNS[b]) == 1]
 _TAILS, _HEADS = (np.array(x) for x in zip(*_EDGES, strict=True))
@@ -50,9 +52,16 @@ class Solids:
 
 def beyond(a: Solids, b: Solids) -> np.ndarray:
     """A lower bound (N,) of the distance: between a and the box around b whose faces are parallel to those of a."""
-    size = (np.abs(np.swapaxes(a.R, 1, 2) @ b.R) @ b.half[..., None])[..., 0]
-    x = np.maximum(np.abs(a.local(b.p)) - a.half - size, 0.0)
+    x = np.maximum(_beside(a, b)[0], 0.0)
     return np.sqrt((x * x).sum(axis=1)) - a.radius - b.radius
+
+
+def _beside(a: Solids, b: Solids) -> tuple[np.ndarray, np.ndarray]:
+    """By how much (N, 3) the box around b whose faces are parallel to those of a is beside the core of a, and where b
+    is (N, 3), in the frame of a."""
+    size = (np.abs(np.swapaxes(a.R, 1, 2) @ b.R) @ b.half[..., None])[..., 0]
+    there = a.local(b.p)
+    return np.abs(there) - a.half - size, there
 
 
 def signed_distances(a: Solids, b: Solids) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -132,21 +141,69 @@ def _segment_to_box(p: np.ndarray, u: np.ndarray, box: Solids) -> tuple[np.ndarr
 
 
 def _between_boxes(a: Solids, b: Solids) -> tuple[np.ndarray, np.ndarray]:
-    """Wherever boxes are nearest, or overlap, an edge of one of them is."""
-    (x, y), (v, u) = _edges_to_box(a, b), _edges_to_box(b, a)
-    x, y = np.concatenate([x, u], axis=1), np.concatenate([y, v], axis=1)
+    """Wherever boxes are nearest, or overlap, an edge of one of them is.
+
+    Most often it is at the corner that reaches furthest towards the other: then there is a slab as thick as they are
+    apart between them, which proves it.  Otherwise all edges are asked.
+    """
+    towards = _towards(a, b)
+    ends = _corner(a, towards), _corner(b, -towards)
+    x, y = _nearest_of(_edges_to_box(*ends[0], b), _edges_to_box(*ends[1], a))
+    n = y - x
+    d = np.sqrt((n * n).sum(axis=1))
+    n /= np.maximum(d, _TINY)[:, None]
+    sizes = sum((np.abs((n[:, None] @ s.R)[:, 0]) * s.half).sum(axis=1) for s in (a, b))
+    doubtful = np.flatnonzero((n * (b.p - a.p)).sum(axis=1) - sizes < d - _PROVED)
+    if len(doubtful):
+        one, two = a[doubtful], b[doubtful]
+        found = _nearest_of(_edges_to_box(*_all_edges(one), two), _edges_to_box(*_all_edges(two), one))
+        x[doubtful], y[doubtful] = found
+    return x, y
+
+
+def _towards(a: Solids, b: Solids) -> np.ndarray:
+    """About the direction (N, 3) from a to b in which they are the least apart: across the faces of the one that is
+    farther beside the other, or between the centres where neither is."""
+    (out_a, at_b), (out_b, at_a) = _beside(a, b), _beside(b, a)
+    out_a, out_b = np.maximum(out_a, 0.0), np.maximum(out_b, 0.0)
+    far_a, far_b = (out_a * out_a).sum(axis=1), (out_b * out_b).sum(axis=1)
+    along = np.where(
+        (far_a >= far_b)[:, None],
+        (a.R @ np.copysign(out_a, at_b)[..., None])[..., 0],
+        -(b.R @ np.copysign(out_b, at_a)[..., None])[..., 0],
+    )
+    return np.where((np.maximum(far_a, far_b) > 0.0)[:, None], along, b.p - a.p)
+
+
+def _corner(box: Solids, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The edges (N, 3) at the corner that reaches furthest along a direction (N, 3), as they begin and go on."""
+    half = np.copysign(box.half, (towards[:, None] @ box.R)[:, 0])
+    corner = box.world(half)
+    return np.repeat(corner[:, None], 3, axis=1), -2 * np.swapaxes(box.R * half[:, None], 1, 2)
+
+
+def _all_edges(box: Solids) -> tuple[np.ndarray, np.ndarray]:
+    """All edges (N, 12, 3), as they begin and go on."""
+    corners = box.p[:, None] + (_SIGNS * box.half[:, None]) @ np.swapaxes(box.R, 1, 2)
+    tails = corners[:, _TAILS]
+    return tails, corners[:, _HEADS] - tails
+
+
+def _edges_to_box(tails: np.ndarray, along: np.ndarray, box: Solids) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest points (N, E, 3) of edges (N, E, 3) and of the boxes."""
+    N, E, _ = tails.shape
+    x, y = _segment_to_box(tails.reshape(-1, 3), along.reshape(-1, 3), box[np.repeat(np.arange(N), E)])
+    return x.reshape(N, E, 3), y.reshape(N, E, 3)
+
+
+def _nearest_of(
+    of_a: tuple[np.ndarray, np.ndarray], of_b: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) of a and of b that are nearest to each other, from those of the edges of each and of the other."""
+    x, y = np.concatenate([of_a[0], of_b[1]], axis=1), np.concatenate([of_a[1], of_b[0]], axis=1)
     best = ((x - y) ** 2).sum(axis=2).argmin(axis=1)
     rows = np.arange(len(x))
     return x[rows, best], y[rows, best]
-
-
-def _edges_to_box(a: Solids, b: Solids) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest points (N, 12, 3) of the edges of a and of b."""
-    N = len(a.p)
-    corners = a.p[:, None] + (_SIGNS * a.half[:, None]) @ np.swapaxes(a.R, 1, 2)
-    tails, heads = corners[:, _TAILS].reshape(-1, 3), corners[:, _HEADS].reshape(-1, 3)
-    x, y = _segment_to_box(tails, heads - tails, b[np.repeat(np.arange(N), len(_TAILS))])
-    return x.reshape(N, -1, 3), y.reshape(N, -1, 3)
 
 
 # -- cores that overlap ------------------------------------------------------------------------------------------------

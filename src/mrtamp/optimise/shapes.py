@@ -7,9 +7,8 @@ come near.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from pydrake.geometry import Box, Capsule, Cylinder, GeometryId, HalfSpace, SceneGraphInspector, Sphere
@@ -36,18 +35,11 @@ class Found:
 
 
 @dataclass(frozen=True, eq=False)
-class _Group:
-    """Geometries (g,) that move with the bodies of one thing: with which `body` (g,), and their poses R, p in it."""
+class Placed:
+    """Geometries at samples: rotations (S, B, 3, 3) of the bodies that they move with, and centres (S, G, 3), in W."""
 
-    index: np.ndarray
-    body: np.ndarray
     R: np.ndarray
     p: np.ndarray
-
-    @cached_property
-    def centred(self) -> bool:
-        """Whether the geometries are where the frames of their bodies are."""
-        return np.array_equal(self.R, np.tile(np.eye(3), (len(self.R), 1, 1))) and not self.p.any()
 
 
 class Shapes:
@@ -71,27 +63,22 @@ class Shapes:
         p: list[np.ndarray] = []
         sizes: list[tuple[np.ndarray, float, float, bool]] = []
 
-        def add(found: list[tuple[GeometryId, int]]) -> _Group:
+        def add(found: Iterable[GeometryId]) -> np.ndarray:
             first = len(self.ids)
-            for g, _ in found:
+            for g in found:
                 X, size = _rounded(scene, inspector, g)
                 self.ids.append(g)
                 R.append(X[:3, :3])
                 p.append(X[:3, 3])
                 sizes.append(size)
-            index = np.arange(first, len(self.ids))
-            body = np.array([b for _, b in found], dtype=int)
-            return _Group(index, body, np.array(R[first:]).reshape(-1, 3, 3), np.array(p[first:]).reshape(-1, 3))
+            return np.arange(first, len(self.ids))
 
-        self._robots: dict[str, _Group] = {}
+        self._robots: dict[str, list[np.ndarray]] = {}
         for name, in_scene in scene.robots.items():
-            number = {b: i for i, b in enumerate(bodies[name])}
-            own = [b for b in robot_bodies(plant, in_scene) if b.name() in number]
-            self._robots[name] = add([(g, number[b.name()]) for b in own for g in geometry_ids(plant, [b])])
-        self._free: dict[str, _Group] = {}
-        for name, parts in scene.free_bodies.items():
-            self._free[name] = add([(g, 0) for g in geometry_ids(plant, parts)])
-        self._static = add([(g, 0) for parts in scene.statics.values() for g in geometry_ids(plant, parts)])
+            own = {b.name(): geometry_ids(plant, [b]) for b in robot_bodies(plant, in_scene)}
+            self._robots[name] = [add(own.get(b, [])) for b in bodies[name]]
+        self._free = {name: add(geometry_ids(plant, parts)) for name, parts in scene.free_bodies.items()}
+        self._static = add(g for parts in scene.statics.values() for g in geometry_ids(plant, parts))
         _, context = scene.context()
         poses = [
             plant.EvalBodyPoseInWorld(context, b).GetAsMatrix4()
@@ -100,41 +87,65 @@ class Shapes:
             for _ in geometry_ids(plant, [b])
         ]
         X = np.array(poses).reshape(-1, 4, 4)
-        self._fixed = _carried(self._static, (X[None, :, :3, :3], X[None, :, :3, 3]), np.arange(len(X)))
+        self._R, self._p = np.array(R).reshape(-1, 3, 3), np.array(p).reshape(-1, 3)
+        # What is static moves with the world.
+        self._p[self._static] = (X[:, :3, :3] @ self._p[self._static, :, None])[..., 0] + X[:, :3, 3]
+        self._R[self._static] = X[:, :3, :3] @ self._R[self._static]
+        self._turned = np.any(np.eye(3) != self._R, axis=(1, 2))
+        self._body = np.zeros(len(self.ids), dtype=int)
+        moving = [part for parts in self._robots.values() for part in parts] + list(self._free.values())
+        for b, part in enumerate(moving, start=1):
+            self._body[part] = b
         self._half = np.array([half for half, _, _, _ in sizes]).reshape(-1, 3)
         self._radius = np.array([radius for _, radius, _, _ in sizes])
         self._bound = np.array([bound for _, _, bound, _ in sizes])
         index = {g: i for i, g in enumerate(self.ids)}
         pairs = [(index[a], index[b]) for a, b in inspector.GetCollisionCandidates() if a in index and b in index]
-        both = np.array(sorted((min(x), max(x)) for x in pairs), dtype=int).reshape(-1, 2)
+        # The larger one first: the box around another tells more in its frame.
+        both = np.array(sorted(sorted(x, key=lambda g: -self._bound[g]) for x in pairs), dtype=int).reshape(-1, 2)
         known = np.array([exact for _, _, _, exact in sizes], dtype=bool)
         mine = known[both].all(axis=1)
         self._pairs, self._others = both[mine], both[~mine]
         self.foreign = {g for g, k in zip(self.ids, known.tolist(), strict=True) if not k}
         """Geometries that are no rounded boxes."""
 
-    def placed(self, n: int, robots: Mapping[str, Poses], free: Mapping[str, Poses]) -> Poses:
-        """Poses of all geometries (n, G) at n samples, from those of the robots' bodies (n, B) and of free bodies (n,).
+    def placed(self, n: int, robots: Mapping[str, Poses], free: Mapping[str, Poses]) -> Placed:
+        """All geometries at n samples, from the poses of the robots' bodies (n, B) and of free bodies (n,).
 
         Free bodies that are not given are nowhere.
         """
-        R = np.zeros((n, len(self.ids), 3, 3))
-        p = np.full((n, len(self.ids), 3), np.nan)
-        R[:, self._static.index], p[:, self._static.index] = self._fixed
-        for name, poses in robots.items():
-            group = self._robots[name]
-            R[:, group.index], p[:, group.index] = _carried(group, poses, group.body)
-        for name, (R_WO, p_WO) in free.items():
-            group = self._free[name]
-            R[:, group.index], p[:, group.index] = _carried(group, (R_WO[:, None], p_WO[:, None]), group.body)
-        return R, p
+        R, p = [np.broadcast_to(np.eye(3), (n, 1, 3, 3))], np.full((n, len(self.ids), 3), np.nan)
+        p[:, self._static] = self._p[self._static]
+        for name, parts in self._robots.items():
+            R_WB, p_WB = robots[name]
+            R.append(R_WB)
+            for b, part in enumerate(parts):
+                if len(part):
+                    p[:, part] = self._carried(part, R_WB[:, b], p_WB[:, b])
+        for name, part in self._free.items():
+            R_WO, p_WO = free.get(name, (np.zeros((n, 3, 3)), None))
+            R.append(R_WO[:, None])
+            if p_WO is not None:
+                p[:, part] = self._carried(part, R_WO, p_WO)
+        return Placed(np.concatenate(R, axis=1), p)
 
-    def near(self, poses: Poses, reach: float) -> Found:
-        """All pairs of rounded boxes within `reach` (m) of each other, at poses (S, G)."""
-        R, p = poses
-        s, c = self._within(p, self._pairs, reach)
+    def _carried(self, part: np.ndarray, R: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Centres (n, g, 3) of geometries that move with a body."""
+        at = self._p[part]
+        return p[:, None] + at @ np.swapaxes(R, 1, 2) if at.any() else p[:, None]
+
+    def _solids(self, at: Placed, s: np.ndarray, g: np.ndarray) -> Solids:
+        """Geometries g (N,) at samples s (N,)."""
+        R = at.R[s, self._body[g]]
+        turned = np.flatnonzero(self._turned[g])
+        R[turned] = R[turned] @ self._R[g[turned]]
+        return Solids(self._half[g], self._radius[g], R, at.p[s, g])
+
+    def near(self, at: Placed, reach: float) -> Found:
+        """All pairs of rounded boxes within `reach` (m) of each other."""
+        s, c = self._within(at.p, self._pairs, reach)
         i, j = self._pairs[c].T
-        a, b = (Solids(self._half[k], self._radius[k], R[s, k], p[s, k]) for k in (i, j))
+        a, b = self._solids(at, s, i), self._solids(at, s, j)
         maybe = np.flatnonzero(beyond(a, b) <= reach)
         maybe = maybe[beyond(b[maybe], a[maybe]) <= reach]
         d, n, x = signed_distances(a[maybe], b[maybe])
@@ -142,12 +153,13 @@ class Shapes:
         kept = maybe[close]
         return Found(s[kept], i[kept], j[kept], d[close], n[close], x[close])
 
-    def unsettled(self, poses: Poses, reach: float) -> np.ndarray:
+    def unsettled(self, at: Placed, reach: float) -> np.ndarray:
         """Samples at which something that is no rounded box may be within `reach` (m) of something else."""
-        R, p = poses
-        s, c = self._within(p, self._others, reach)
+        s, c = self._within(at.p, self._others, reach)
+        if not len(s):
+            return s
         i, j = self._others[c].T
-        a, b = (Solids(self._half[k], self._radius[k], R[s, k], p[s, k]) for k in (i, j))
+        a, b = self._solids(at, s, i), self._solids(at, s, j)
         endless = ~np.isfinite(self._bound[i] + self._bound[j])
         apart = (beyond(a, b) > reach) | (beyond(b, a) > reach)
         return np.unique(s[endless | ~apart])
@@ -167,13 +179,6 @@ class Shapes:
             square += apart
         c, s = np.divmod(np.flatnonzero(square < (limit * limit)[:, None]), len(p))
         return s, c
-
-
-def _carried(group: _Group, poses: Poses, body: np.ndarray) -> Poses:
-    R, p = poses[0][:, body], poses[1][:, body]
-    if group.centred:
-        return R, p
-    return R @ group.R, p + (R @ group.p[..., None])[..., 0]
 
 
 def _rounded(
