@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from discs import disc_problem, errand
+from discs import HEIGHT, RADIUS, Errands, disc_problem, errand
 from gantry import gantry_problem, valid_plan
+from pydrake.math import RigidTransform
 
 from mrtamp.collision import Collision
 from mrtamp.kinematics import inverse, rotation_vectors
@@ -17,6 +19,7 @@ from mrtamp.optimise.collisions import CollisionRows
 from mrtamp.optimise.fine import knot_samples
 from mrtamp.optimise.nearness import Near, Nearness, State
 from mrtamp.plan import Plan
+from mrtamp.problem import Shape, StaticBody
 from mrtamp.transitions.families import grasp_families
 
 STEP = 1e-5
@@ -164,3 +167,17 @@ def test_finer_levels_look_at_more_samples_of_every_step(gantries: Optimiser) ->
         assert distance.shape == (steps, 3)
         assert fine.clearance[who].shape == (steps, 5)
         assert fine.clearance[who][:, ::2] == pytest.approx(distance), "those it had are among them"
+
+
+@pytest.mark.parametrize(("height", "within", "lost"), [(0.06, 0.02, False), (0.06, 0.3, True), (2.0, 0.3, False)])
+def test_no_joint_leads_out_of_what_is_flat_across_the_plane(
+    tmp_path: Path, height: float, within: float, lost: bool
+) -> None:
+    """Far within a block that is flat, the shortest way out is above it, where a disc never goes."""
+    block = StaticBody("block", RigidTransform([0, 1.2, HEIGHT - 0.05]), Shape("box", (1.0, 1.0, height)))
+    problem = replace(disc_problem(tmp_path), subgoals=(), goal=(), statics=(block,))
+    plan = Errands(problem).move(a=(-1.2, -0.5)).move(a=(-1.2, 1.2)).move(a=(within - 0.5 - RADIUS, 1.2)).plan()
+    found = rows(optimiser(plan, draft=True))
+    assert found.deepest(0.0) == pytest.approx(min(within, height / 2), abs=1e-3)
+    assert found.lost(0.0) is lost
+    assert not found.lost(tolerance=height), "what is tolerated may be so"

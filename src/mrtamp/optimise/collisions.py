@@ -35,6 +35,8 @@ _CONTENDS = 3e-3
 """Distance (m) from which on a pair of solids has a share in it: the more the closer."""
 _FAINT = 1e-6
 """What farther pairs claim where no pair is as close as that: the closest has it all."""
+_DEAD = 1e-9
+"""Penetration (m) that counts, and sum of derivatives below which no joint changes it."""
 _PARTS = 24
 """Places in a step at which violations are remembered."""
 
@@ -66,6 +68,14 @@ class CollisionRows:
     def deepest(self, tolerance: float) -> float:
         """The largest penetration (m) beyond what is allowed and tolerated."""
         return max(0.0, float(self.depth.max(initial=0.0)) - tolerance)
+
+    def lost(self, tolerance: float) -> bool:
+        """Whether something penetrates further than is tolerated and no joint can do anything about it nearby.
+
+        The shortest way out of what is flat may be across the plane in which robots slide.
+        """
+        deep = self.A[np.flatnonzero(self.depth > tolerance + _DEAD)]
+        return bool(np.any(np.abs(deep).sum(axis=1) < _DEAD))
 
     def knots_beyond(self, depth: float, shape: tuple[int, int]) -> np.ndarray:
         """Numbers of those of the knots (K, N) at or next to which some penetration is larger than `depth` (m)."""

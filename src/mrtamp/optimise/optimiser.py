@@ -368,7 +368,8 @@ class Optimiser:
 
     def _too_deep(self, x: Iterate, rows: CollisionRows, enough: float, before: float) -> bool:
         """Whether an iterate collides more than is worth following, for all that a draft gains."""
-        deep = rows.deepest(self.problem.collision.tolerance) > enough
+        tolerance = self.problem.collision.tolerance
+        deep = rows.deepest(tolerance) > enough or (np.isfinite(self.cost) and rows.lost(tolerance))
         return deep and not (np.isinf(self.cost) and self._merit(x, rows) < before)
 
     def _held_back(self, now: Iterate, solved: Iterate, deep: np.ndarray) -> Iterate | None:
