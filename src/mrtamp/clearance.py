@@ -39,7 +39,7 @@ class Track:
         self.centres = world.bounds.spheres(q)
         self.radii = world.bounds.radii
         R, self.hand = world.tool.pose(q)
-        axes = self.hand[:, None] + np.einsum("nij,kj->nki", R, 0.1 * np.eye(3))
+        axes = self.hand[:, None] + 0.1 * np.swapaxes(R, 1, 2)
         travel = np.linalg.norm(np.diff(self.centres, axis=0), axis=2).max(axis=1, initial=0.0)
         points = np.concatenate([axes, self.hand[:, None]], axis=1)
         self.travel = np.maximum(travel, np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1))

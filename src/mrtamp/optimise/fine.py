@@ -79,7 +79,7 @@ class FineCheck:
     def _points(self, robot: str, x: np.ndarray) -> np.ndarray:
         """Where tracked points (n, P, 3) of a robot are in configurations x (n, N)."""
         spheres, R, p = self.nearness.worlds[robot].spheres_and_grasp(x)
-        hand = p[:, None] + np.einsum("nij,kj->nki", R, 0.1 * np.eye(3))
+        hand = p[:, None] + 0.1 * np.swapaxes(R, 1, 2)
         return np.concatenate([spheres, hand], axis=1)
 
     def _travel(self, line: Polyline, q: np.ndarray) -> dict[str, np.ndarray]:

@@ -88,10 +88,7 @@ class Meetings:
             rolls.append(matrix(R, where - np.einsum("nij,nj->ni", R, middle)))
         # Mostly the roll that both arms are most at ease with; one in four is the first drawn.
         maps = self.workspace.maps
-        ease = [
-            maps[giver].distances(X @ X_OG1).min(axis=1) + maps[receiver].distances(X @ X_OG2).min(axis=1)
-            for X in rolls
-        ]
+        ease = [maps[giver].distances(X @ X_OG1) + maps[receiver].distances(X @ X_OG2) for X in rolls]
         best = np.where(self.rng.random(n) < 0.75, np.argmin(ease, axis=0), 0)
         X_WO = np.array(rolls)[best, np.arange(n)]
         q, solved = self.workspace.ik(giver, X_WO @ X_OG1, self.workspace.seeds(giver, X_WO @ X_OG1, 0.6))

@@ -7,6 +7,7 @@ targets.
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mrtamp.kinematics import Tool
 from mrtamp.transitions.projection import uniform_configurations
@@ -28,21 +29,23 @@ class ReachabilityMap:
     def __init__(self, tool: Tool) -> None:
         # A generator of its own: the map belongs to the robot, not to a planning run.
         self._q = uniform_configurations(tool, np.random.default_rng(0), _SIZE)
-        R, self._p = tool.pose(self._q)
-        self._R = R.reshape(_SIZE, 9)
-        self.centre = self._p.mean(axis=0)
+        R, p = tool.pose(self._q)
+        self._tree = cKDTree(_features(R, p))
+        self.centre = p.mean(axis=0)
         # Random configurations rarely stretch out fully.
-        self.radius = 1.05 * float(np.linalg.norm(self._p - self.centre, axis=1).max()) + 0.03
+        self.radius = 1.05 * float(np.linalg.norm(p - self.centre, axis=1).max()) + 0.03
 
     def distances(self, X_WG: np.ndarray) -> np.ndarray:
-        """Squared distances (N, M) of hand poses (N, 4, 4) to those of the map; a turn by t counts 2 (1 - cos t)."""
-        # einsum, because a matrix product of this shape is spread over threads, which costs more than it gains.
-        p = X_WG[:, :3, 3]
-        square = (p**2).sum(axis=1)[:, None] + (self._p**2).sum(axis=1) - 2 * np.einsum("ni,mi->nm", p, self._p)
-        turn = 3 - np.einsum("ni,mi->nm", X_WG[:, :3, :3].reshape(-1, 9), self._R)
-        return square / _LENGTH**2 + turn
+        """Squared distances (N,) from hand poses (N, 4, 4) to the nearest of the map; to turn by t is 2 (1 - cos t)."""
+        return self._tree.query(_features(X_WG[:, :3, :3], X_WG[:, :3, 3]))[0] ** 2
 
     def seeds(self, X_WG: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """For each hand pose (N, 4, 4) one of the configurations (N, n) that come nearest to it."""
-        nearest = np.argpartition(self.distances(X_WG), _NEAREST, axis=1)[:, :_NEAREST]
+        nearest = self._tree.query(_features(X_WG[:, :3, :3], X_WG[:, :3, 3]), _NEAREST)[1]
         return self._q[nearest[np.arange(len(X_WG)), rng.integers(_NEAREST, size=len(X_WG))]]
+
+
+def _features(R: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Points (N, 12) as far apart as poses are: half the square of the distance of two rotation matrices is 3 minus the
+    trace of the one times the inverse of the other, 2 (1 - cos t)."""
+    return np.concatenate([R.reshape(-1, 9) / np.sqrt(2), p / _LENGTH], axis=1)
