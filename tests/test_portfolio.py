@@ -164,6 +164,22 @@ def test_only_a_first_plan_that_is_far_dearer_than_promised_has_to_wait(
     assert realisation.presentable(plan) is plan
 
 
+def test_a_first_plan_is_kept_where_its_refinement_is_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planner = planner_for(tmp_path)
+    plan = roundabout(planner, 0.6)
+    planner.realisation._promised = 0.4 * plan.cost
+
+    def interrupted(self: Optimiser) -> float:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Optimiser, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        planner.realisation.presentable(plan)
+    assert planner.best is plan
+
+
 def test_what_the_same_search_finds_takes_the_place_of_what_has_hardly_begun(tmp_path: Path) -> None:
     """With the same order of events it most likely becomes the same plan: it is not worth a trial of its own."""
     planner = planner_for(tmp_path)

@@ -165,6 +165,7 @@ class Planner:
             self.portfolio,
             self.root,
             self._to_beat,
+            self._offer,
             descent=Descent(self.sampler, self.portfolio.nearness) if self._uses("way-descent") else None,
             drafts=self._uses("drafts"),
             refining=self._uses("refinement"),

@@ -77,6 +77,7 @@ class Realisation:
     incumbent : has plans judged.  portfolio : takes drafts, and knows which orders of events are under refinement.
     root : the tree's root, where every skeleton starts.
     to_beat : cost that a skeleton has to promise less than.
+    offer : makes a plan the incumbent if it is cheaper.
     descent : shortens ways along their strata; None: they stay as they were sampled.
     drafts : whether skeletons are also put under refinement as they are.
     refining : whether a dear first plan is refined before it counts.
@@ -94,6 +95,7 @@ class Realisation:
         portfolio: Portfolio,
         root: Node,
         to_beat: Callable[[], float],
+        offer: Callable[[Plan], bool],
         *,
         descent: Descent | None = None,
         drafts: bool = True,
@@ -105,6 +107,7 @@ class Realisation:
         self.portfolio = portfolio
         self.root = root
         self.to_beat = to_beat
+        self.offer = offer
         self.descent = descent
         self.drafts = drafts and portfolio.convex
         self.refines = refining and portfolio.convex
@@ -170,8 +173,14 @@ class Realisation:
     def presentable(self, plan: Plan) -> Plan:
         """The first plan, refined a little where it is far dearer than skeletons promised and that is quick."""
         enough = _DEAR * self._promised
-        dear = plan.cost > enough and len(plan.transitions) <= _MANY
-        return self.portfolio.refined(plan, enough, _PROGRAMS) if dear and self.refines else plan
+        if not self.refines or plan.cost <= enough or len(plan.transitions) > _MANY:
+            return plan
+        try:
+            return self.portfolio.refined(plan, enough, _PROGRAMS)
+        except BaseException:
+            # Whatever interrupts this, there is a plan.
+            self.offer(plan)
+            raise
 
     def _judged(self, timed: Timed | None, schedule: SpaceTime | None, proposal: Proposal) -> Plan | None:
         """The plan of a realisation if the judge accepts it, after some attempts without the steps it objected to."""
