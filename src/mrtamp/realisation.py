@@ -203,10 +203,7 @@ class Realisation:
         if self._first:
             for _ in range(_FIRST_GROWTHS):
                 self.skeletons.grow(*_FIRST_WAYS)
-                if (
-                    self.skeletons.hands_over
-                    or min(self.skeletons.counts.values(), default=_FIRST_WAYS[1]) >= _FIRST_WAYS[1]
-                ):
+                if self.skeletons.hands_over or all(n >= _FIRST_WAYS[1] for n in self.skeletons.counts.values()):
                     break
             if self.descent is not None:
                 self.skeletons.shorten(self.descent, _FIRST_SHORTENED)
