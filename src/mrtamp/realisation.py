@@ -25,8 +25,9 @@ from mrtamp.transitions.ways import Way
 
 _FIRST_WAYS, _MORE_WAYS = (80, 14), (64, 20)
 """IK seeds, and ways kept, per task and robots: before there is a plan, and later."""
-_FIRST_GROWTHS = 3
-"""How often ways are sampled before there is a plan, at most, as long as a task has fewer than are kept at a time."""
+_FEW_TASKS, _FIRST_GROWTHS = 4, 3
+"""Where there are no more tasks, how often ways are sampled before there is a plan, at most, as long as one of them has
+fewer ways than are kept at a time."""
 _FIRST_SHORTENED, _SHORTENED = 16, 40
 """Of these, how many are shortened."""
 _GROWTHS, _SLOW_GROWTHS, _WORTH_GROWING = 32, 2, 0.02
@@ -55,9 +56,9 @@ _DETERRENT = 100.0
 """By how many times dearer a skeleton seems for a conflict of 1 in its draft."""
 _POOR = 2.0
 """A first realisation that costs so many times what its skeleton promised is not the only one."""
-_DEAR, _PROGRAMS = 2.1, 8
+_DEAR, _PROGRAMS, _FEW_STOPS = 2.1, 8, 8
 """If the best of them still costs so many times that, it has so many convex programs to become cheaper before it counts
-as a plan."""
+as a plan; where there are more stops they take too long for that."""
 _MENDINGS = 8
 """Times that a realisation is judged, steps to which the judge objected being forbidden before the next."""
 _MANY = 12
@@ -173,7 +174,7 @@ class Realisation:
     def presentable(self, plan: Plan) -> Plan:
         """The first plan, refined a little where it is far dearer than skeletons promised and that is quick."""
         enough = _DEAR * self._promised
-        if not self.refines or plan.cost <= enough or len(plan.transitions) > _MANY:
+        if not self.refines or plan.cost <= enough or len(plan.transitions) > _FEW_STOPS:
             return plan
         try:
             return self.portfolio.refined(plan, enough, _PROGRAMS)
@@ -203,7 +204,9 @@ class Realisation:
         if self._first:
             for _ in range(_FIRST_GROWTHS):
                 self.skeletons.grow(*_FIRST_WAYS)
-                if self.skeletons.hands_over or all(n >= _FIRST_WAYS[1] for n in self.skeletons.counts.values()):
+                counts = self.skeletons.counts.values()
+                slow = self.skeletons.hands_over or len(counts) > _FEW_TASKS
+                if slow or all(n >= _FIRST_WAYS[1] for n in counts):
                     break
             if self.descent is not None:
                 self.skeletons.shorten(self.descent, _FIRST_SHORTENED)
