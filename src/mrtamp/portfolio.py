@@ -40,7 +40,7 @@ _LUCK = 0.93
 _RETIMINGS, _SOONER, _APART = 2, 0.99, 3e-3
 """Times that a draft which is about to be given up is timed anew, share of its cost that this may leave at most, and
 its largest conflict then."""
-_ASTRAY = 1.4
+_ASTRAY = 1.2
 """A plan that costs so many times the least that is possible most likely goes the wrong way around."""
 _ALIKE = 0.02
 """Relative difference of cost below which two plans with the same order of events are held to be alike."""
